@@ -1,7 +1,7 @@
 """Parts of self-contained pages without scripts; figures are SVG elements.
 
-Figures have the width of a journal's column and text of 8 points: two side by side on paper, one on
-a phone. In dark mode their lightness is inverted.
+Figures have the width of a journal's column and text of 8 points; on paper they are smaller, two
+side by side. In dark mode their lightness is inverted.
 """
 
 import html
@@ -22,6 +22,7 @@ _METADATA = re.compile(r"<metadata>.*?</metadata>", re.DOTALL)
 _GROUP = re.compile(r'<g id="[^"]*"')
 _SIZE = re.compile(r'<svg[^>]*viewBox="([^"]*)"[^>]*>')
 _PATH = re.compile(r'\bd="[^"]*"')
+_NUMBER = re.compile(r"[-+]?[\d.,]*(e[-+]\d+)?\*?|nan|inf")  # or missing
 _DIGITS = re.compile(r"(\.\d\d)\d+")
 
 _CSS = """
@@ -32,22 +33,23 @@ _CSS = """
     --note: #3d3212; --bad: #4a1d18; }
   figure svg { filter: invert(0.93) hue-rotate(180deg); }
 }
-body { font: 15px/1.45 system-ui, "DejaVu Sans", sans-serif; color: var(--ink);
+html { font-size: 15px; }
+body { font: 1rem/1.45 system-ui, "DejaVu Sans", sans-serif; color: var(--ink);
   background: var(--paper); max-width: 1160px; margin: 0 auto; padding: 1.2rem;
   counter-reset: figure; }
-h1 { font-size: 1.5rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
-h2 { font-size: 1.1rem; margin: 1.8rem 0 .5rem; border-bottom: 1px solid var(--line); }
+h1 { font-size: 1.6rem; margin: 0 0 .2rem; overflow-wrap: anywhere; }
+h2 { font-size: 1.2rem; margin: 1.8rem 0 .5rem; border-bottom: 1px solid var(--line); }
 .file { color: var(--quiet); margin: 0 0 1rem; overflow-wrap: anywhere; }
-.headline { font-size: 1.1rem; margin: .8rem 0; }
+.headline { font-size: 1.2rem; margin: .8rem 0; }
 .note, .bad { border-left: 4px solid #e69f00; padding: .5rem .8rem; background: var(--note); }
 .bad { border-color: #d55e00; background: var(--bad); }
-.side { columns: 27rem; column-gap: 2.5rem; margin-top: 1.8rem; }
+.side { columns: 29rem; column-gap: 2.5rem; margin-top: 1.8rem; }
 .side section { break-inside: avoid; margin-bottom: 1.8rem; }
 .side h2 { margin-top: 0; }
-.figures { columns: 20.1rem; column-gap: 1.5rem; margin-top: 1rem; }
+.figures { columns: 21.4rem; column-gap: 1.5rem; margin-top: 1rem; }
 figure { margin: 0 0 1.2rem; break-inside: avoid; }
-figure svg { display: block; width: 100%; height: auto; max-width: 30rem; }
-figcaption { color: var(--quiet); font-size: .85rem; max-width: 30rem; }
+figure svg { display: block; width: 100%; height: auto; max-width: 32rem; }
+figcaption { color: var(--quiet); font-size: .9rem; max-width: 32rem; }
 figcaption::before { counter-increment: figure; content: "Figure " counter(figure) ". ";
   font-weight: 600; }
 table { border-collapse: collapse; margin: .3rem 0; }
@@ -56,17 +58,16 @@ th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0;
 th { font-weight: 600; white-space: nowrap; }
 td { font-variant-numeric: tabular-nums; }
 section td { overflow-wrap: anywhere; }
-.numbers td { white-space: nowrap; }
-.numbers td, .numbers th { padding-right: .6rem; }
-.numbers td:not(:first-child), .numbers th:not(:first-child) { text-align: right; }
-pre { background: var(--pale); padding: .8rem; overflow-x: auto; font-size: 13px; }
+.number { text-align: right; padding-right: .6rem; }
+td.number, td.word { white-space: nowrap; }
+pre { background: var(--pale); padding: .8rem; overflow-x: auto; font-size: .87rem; }
 summary { cursor: pointer; }
-dt { font-weight: 600; } dd { margin: 0 0 .4rem 1rem; }
+dt { font-weight: 600; break-after: avoid; } dd { margin: 0 0 .4rem 1rem; break-inside: avoid; }
 .wide { overflow-x: auto; }
 .wide th { white-space: normal; }
 @page { margin: 12mm; }
-@media print { body { max-width: none; padding: 0; font-size: 9pt; }
-  .figures, .side { columns: 2; column-gap: 5mm; } .figures svg { max-width: 78mm; }
+@media print { html { font-size: 9pt; } body { max-width: none; padding: 0; }
+  .figures, .side { columns: 2; column-gap: 5mm; } .figures svg { max-width: 68mm; }
   h2 { break-after: avoid; } tr { break-inside: avoid; }
   .wide { overflow: visible; } details { display: none; } }
 """
@@ -105,14 +106,25 @@ def rows(heading: str, cells: Sequence[tuple[str, str]]) -> str:
     return f"<section><h2>{text(heading)}</h2><table>{body}</table></section>"
 
 
-def grid(headings: Iterable[str], cells: Iterable[Iterable[str]], css: str = "") -> str:
-    """Return a table of plain texts."""
-    head = "".join(f"<th>{text(heading)}</th>" for heading in headings)
-    lines = ("".join(f"<td>{text(cell)}</td>" for cell in row) for row in cells)
-    body = "\n".join(f"<tr>{line}</tr>" for line in lines)
-    return (
-        f'<div class="wide" tabindex="0"><table class="{css}"><tr>{head}</tr>\n{body}</table></div>'
-    )
+def grid(headings: Iterable[str], cells: Iterable[Iterable[str]]) -> str:
+    """Return a table of plain texts; columns of numbers are aligned to the right."""
+    head, *body = [list(headings), *map(list, cells)]
+    kinds = [_kind(column[1:]) for column in zip(head, *body, strict=True)]
+
+    def row(tag: str, line: list[str]) -> str:
+        texts = zip(kinds, map(text, line), strict=True)
+        cells = (f'<{tag} class="{kind}">{cell}</{tag}>' for kind, cell in texts)
+        return f"<tr>{''.join(cells)}</tr>"
+
+    table = "\n".join((f"<thead>{row('th', head)}</thead>", *(row("td", line) for line in body)))
+    return f'<div class="wide" tabindex="0"><table>{table}</table></div>'
+
+
+def _kind(column: Sequence[str]) -> str:
+    """Return the class of a column's cells: ``number``, ``word`` (never wrapped) or ``text``."""
+    if all(map(_NUMBER.fullmatch, column)):
+        return "number"
+    return "text" if any(" " in cell for cell in column) else "word"
 
 
 def figures(sheets: Iterable[FigureSpec]) -> str:
@@ -157,7 +169,8 @@ def definitions(heading: str, terms: Sequence[tuple[str, str]]) -> str:
 
 DEFINITIONS = {
     "average cycle": (
-        "Mean of all whole steady cycles on bins of phase; basis of every figure that is not raw."
+        "Mean of all complete steady cycles in bins of phase. All metrics are computed from it, "
+        "except those of single samples."
     ),
     "peak hysteresis": (
         "Largest difference of displacement between a rising and a falling branch at one input, "

@@ -36,15 +36,16 @@ def hysteresis_loop(recording: Recording, focus: int = 0) -> FigureSpec | None:
     if everything.size == 0:
         return None
     line = np.array([1.0, 0.0]) if recording.compensated else _closest_line(everything)
+    ideal = "the ideal line" if recording.compensated else "a linear fit"
     averaged = any(part.cycle is not None for part in parts)
     title = "average steady cycle" if averaged else "as measured, not averaged"
     widest = parts[focus] if focus < len(parts) and loops[focus].size else None
     draw = partial(_draw, recording=recording, loops=loops, focus=focus, widest=widest, line=line)
     panels = (
         Panel(partial(draw, taken_off=np.zeros(2)), title, 0.75),
-        Panel(partial(draw, taken_off=line), "off the straight line", 0.5),
+        Panel(partial(draw, taken_off=line), f"deviation from {ideal}", 0.5),
     )
-    caption = f"Displacement against {_input_name(recording)}, and what is off a straight line."
+    caption = f"Displacement against {_input_name(recording)}, and its deviation from {ideal}."
     return FigureSpec("hysteresis", caption, panels)
 
 
@@ -89,8 +90,8 @@ def _draw(
     if widest is not None:
         _mark_gap(axes, widest, taken_off)
     unit = "µm" if recording.compensated else recording.command_unit
-    left = " less line" if taken_off.any() else ""
-    axes.set(xlabel=f"{_input_name(recording)}, {unit}", ylabel=f"displacement{left}, µm")
+    name = "deviation" if taken_off.any() else "displacement"
+    axes.set(xlabel=f"{_input_name(recording)}, {unit}", ylabel=f"{name}, µm")
 
 
 def _colours(loops: int) -> list[object]:
@@ -125,19 +126,19 @@ def before_and_after(before: Recording, after: Recording) -> FigureSpec | None:
     shown = [of_range(loop) for loop in loops if loop is not None]
     if len(shown) < 2:
         return None
-    styles = (WITHOUT, "without compensator"), (WITH, "with it")
+    styles = (WITHOUT, "without compensator"), (WITH, "with compensator")
 
     def draw(axes: Axes, off_line: float) -> None:
         for (x, y), (colour, label) in zip(shown, styles, strict=True):
             axes.plot(x, y - off_line * x, color=colour, linewidth=1.0, label=label)
         straight = [0.0, 100.0 * (1.0 - off_line)]
         axes.plot([0.0, 100.0], straight, color=REFERENCE, linestyle=":", linewidth=0.8)
-        left = " less line" if off_line else ""
-        axes.set(xlabel="input, % of its range", ylabel=f"displacement{left}, % of its range")
+        name = "deviation, % of range" if off_line else "displacement, % of its range"
+        axes.set(xlabel="input, % of its range", ylabel=name)
 
     panels = (
         Panel(partial(draw, off_line=0.0), "loops", _SQUARE),
-        Panel(partial(draw, off_line=1.0), "off the straight line"),
+        Panel(partial(draw, off_line=1.0), "deviation from the ideal line"),
     )
     caption = "Before and after compensation, each over its own range; dotted: no hysteresis."
     return FigureSpec("before_and_after", caption, panels)

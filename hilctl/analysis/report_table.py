@@ -16,18 +16,18 @@ def number(value: float | None, unit: str = "") -> str:
 def run_rows(report: RunReport) -> list[tuple[str, str]]:
     """Return name and value of the run, its samples, timing and end."""
     simulated = f" ({SIMULATED})" if report.simulated else ""
-    held_against = "reference" if report.compensated else "command: nothing compensated"
+    loop_input = "reference" if report.compensated else "command (no compensator)"
     reason = printable(report.reason) or MISSING
     labels = ", ".join(f"{key} {value}" for key, value in report.labels.items())
     return [
         *([("labels", printable(labels))] if labels else []),
         ("device", f"{printable(report.device) or MISSING}{simulated}"),
-        ("device is", printable(report.device_description) or MISSING),
+        ("device description", printable(report.device_description) or MISSING),
         ("ended", f"{reason}{'' if report.complete else ' (NOT complete)'}"),
         ("samples", f"{report.samples:,} of the waveform, {report.ramp_samples:,} of ramps"),
         ("missing samples", f"{report.dropped:,}"),
         ("rate, length", f"{report.sample_rate_hz:g} Hz, {quantity(report.duration_s, 's', 4)}"),
-        ("loop", f"displacement against {held_against}"),
+        ("loop", f"displacement against {loop_input}"),
         ("command", _range(report.command_min, report.command_max, report.command_unit)),
         ("displacement", _range(report.displacement_min_um, report.displacement_max_um, "um")),
         ("limited samples", f"{report.limited_samples:,}"),
@@ -38,7 +38,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         *(("mark", f"{at_s:.6g} s: {printable(text)}") for at_s, text in report.marks),
         ("lateness", _percentiles(report.lateness_us)),
         ("exchange", _percentiles(report.exchange_us)),
-        *((f"{name} took", usage_text(each)) for name, each in report.processes.items()),
+        *((f"{name} process", usage_text(each)) for name, each in report.processes.items()),
     ]
 
 
@@ -62,11 +62,11 @@ def quality_rows(report: RunReport) -> list[tuple[str, str]]:
         ("peak-to-peak", report.peak_to_peak_um, "um", ""),
         ("peak error", report.peak_error_percent, "%", ""),
         ("rms error", report.rms_error_percent, "%", ""),
-        ("error, not averaged", report.peak_error_raw_percent, "%", raw),
+        ("error, single samples", report.peak_error_raw_percent, "%", raw),
         ("sensor noise", report.sensor_noise_um, "um", " rms"),
     ]
     known = [(name, number(v, unit) + more) for name, v, unit, more in rows if v is not None]
-    counts = ("steady cycles", report.steady_cycles), ("steady samples", report.steady_samples)
+    counts = ("steady cycles", report.steady_cycles), ("evaluated samples", report.steady_samples)
     return [*known, *((name, f"{count:,}") for name, count in counts if count)]
 
 

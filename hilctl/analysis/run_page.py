@@ -14,7 +14,7 @@ from hilctl.analysis.report import worst_segment
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import ConfigError
 from hilctl.base.events import Event
-from hilctl.base.formatting import MISSING, printable, quantity, significant
+from hilctl.base.formatting import MISSING, printable, quantity, significant, unit_text
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import parse_model
 from hilctl.recording.metadata_keys import OVERRIDES_FACT
@@ -54,7 +54,7 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
     samples = [
         (name, value)
         for name, value in report_table.run_rows(report)
-        if name not in {"labels", "device", "device is"}
+        if name not in {"labels", "device", "device description"}
         and value != MISSING
         # The end of an incomplete run is above.
         and (report.complete or name != "ended")
@@ -168,7 +168,7 @@ def _segments(report: RunReport) -> list[str]:
         return []
     note = html.paragraph("The results above are the worst of these.")
     headings, rows = report_table.segment_table(report)
-    return ["<h2>By segment</h2>", note, html.grid(headings, rows, "numbers")]
+    return ["<h2>By segment</h2>", note, html.grid(headings, rows)]
 
 
 def _events(events: Sequence[Event]) -> list[str]:
@@ -192,13 +192,13 @@ def _rows(recording: Recording) -> Iterator[tuple[str, str]]:
         yield key, str(value)
     simulated = f" ({report_table.SIMULATED})" if run.get("simulated") == "true" else ""
     yield "device", f"{run.get('device', '')}{simulated}"
-    yield "device is", run.get("device_description", "")
+    yield "device description", run.get("device_description", "")
     yield "computer", ", ".join(filter(None, (run.get("host", ""), run.get("kernel", ""))))
     yield "hilctl", run.get("hilctl", "")
     segments = recording.segments
     more = f" and {len(segments) - 1} more" if len(segments) > 1 else ""
     yield "waveform", f"{segments[0].label}{more}" if segments else ""
-    yield "its settings", _settings(recording)
+    yield "waveform settings", _settings(recording)
     yield "limits", _listed(run.get("limits", ""))
     yield "overrides", _listed(run.get(OVERRIDES_FACT, ""))
     yield from _model(recording)
@@ -217,7 +217,7 @@ def _settings(recording: Recording) -> str:
         for key, text in recording.run.items()
         if key.startswith(_WAVEFORM) and key not in _NOT_SHOWN and text not in _USUAL
     }
-    unit = recording.run.get("waveform.unit", "")
+    unit = unit_text(recording.run.get("waveform.unit", ""))
     shown = [f"{key} {text}" for key, text in found.items()]
     return ", ".join([*shown, *([f"unit {unit}"] if unit else [])])
 
@@ -236,29 +236,29 @@ def _listed(text: str) -> str:
 def _model(recording: Recording) -> Iterator[tuple[str, str]]:
     kind = recording.run.get("compensator", "none")
     if kind == "none":
-        yield "compensator", "none: the waveform goes straight to the actuator"
+        yield "compensator", "none: the waveform is the command"
         return
     yield "compensator", f"inverse of a model of kind {kind}"
     if recording.correction_yaml:
-        yield "correction", "learned, and added to the reference"
+        yield "correction", "learned, added to the reference"
     try:
         model = parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
     except ConfigError:  # of another version
-        yield "model", "can't be read by this version"
+        yield "model", "not readable by this version"
         return
     provenance = model.provenance
-    yield "model from", ", ".join(provenance.source)
-    yield "model made", _date(provenance.created or "")
+    yield "model source", ", ".join(provenance.source)
+    yield "model created", _date(provenance.created or "")
     yield "model error", model_error(model)
 
 
 def model_error(model: HysteresisModel) -> str:
     """Return the error of a model, on data outside the fit if known."""
     errors = model.provenance.errors_percent
-    for prefix, of in (("held_out_", "on data that the fit did not see"),
-                       ("", "on the data of the fit; on others it is not known")):  # fmt: skip
+    for prefix, of in (("held_out_", "on data not fitted"),
+                       ("", "on the data of the fit (no validation data)")):  # fmt: skip
         peak, rms = errors.get(f"{prefix}peak"), errors.get(f"{prefix}rms")
         if peak is not None:
             also = f", {significant(rms)} % rms" if rms is not None else ""
             return f"{quantity(peak, '%')} peak{also}, {of}"
-    return "not known"
+    return "unknown"

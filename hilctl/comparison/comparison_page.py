@@ -21,7 +21,7 @@ def comparison_page(comparison: Comparison) -> str:
     body = [
         "<h1>Comparison of models</h1>",
         html.paragraph(", ".join(comparison.sources), "file"),
-        html.grid(headings(comparison), table_rows(comparison), "numbers"),
+        html.grid(headings(comparison), table_rows(comparison)),
         *map(html.paragraph, notes(comparison)),
         html.grid(("model", "description"), [(row.name, row.title) for row in comparison.rows]),
         html.figures(comparison_sheets(comparison)),
@@ -49,7 +49,8 @@ def comparison_sheets(comparison: Comparison) -> Iterator[FigureSpec]:
     number = _fastest(loops)
     for k, row in enumerate(rows):
         modelled_um, unit = row.error.modelled_um[number], row.model.input_unit
-        yield record_sheet(loops[number], modelled_um, unit, row.name, NAMED[k % len(NAMED)])
+        name, colour = f"{row.name} model", NAMED[k % len(NAMED)]
+        yield record_sheet(loops[number], modelled_um, unit, name, colour)
 
 
 def _fastest(loops: Sequence[SteadyLoop]) -> int:

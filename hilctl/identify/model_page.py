@@ -25,6 +25,7 @@ from hilctl.identify.summary import (
     summary,
     worse_lines,
 )
+from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import dump_model
 
 MOST_RECORDS = 36
@@ -36,23 +37,27 @@ def identification_page(found: Identification) -> str:
     """Return the page as HTML."""
     fit = found.fit
     unit = fit.model.input_unit
-    title = f"Identified from {', '.join(fit.model.provenance.source)}"
-    lines = fit.model.provenance.method, *summary(found)
-    body = [f"<h1>{html.text(title)}</h1>", *map(html.paragraph, lines)]
+    body = _head("Identified model", fit.model, [fit.model.provenance.method, *summary(found)])
     if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on data not fitted</h2>"]
-        body += [html.grid(HEADINGS, error_rows(held_out.judgement.errors), "numbers")]
+        body += [html.grid(HEADINGS, error_rows(held_out.judgement.errors))]
         body += ["<h2>Model and data not fitted</h2>"]
         body += drawn_records(held_out.judgement, held_out.records, unit)
     body += [
         "<h2>Errors on data fitted</h2>",
-        html.grid(HEADINGS, error_rows(fit.errors), "numbers"),
+        html.grid(HEADINGS, error_rows(fit.errors)),
         "<h2>Model and data</h2>",
         *drawn_records(fit, found.data, unit),
         "<h2>Parameters</h2>",
-        html.grid(("name", "value"), parameter_texts(fit), "numbers"),
+        html.grid(("name", "value"), parameter_texts(fit)),
     ]
-    return html.document(html.text(title), [*body, html.details("Model", dump_model(fit.model))])
+    return html.document("Identified model", [*body, html.details("Model", dump_model(fit.model))])
+
+
+def _head(title: str, model: HysteresisModel, lines: Sequence[str]) -> list[str]:
+    """Return title, sources and results."""
+    source = html.paragraph(", ".join(model.provenance.source), "file")
+    return [f"<h1>{title}</h1>", source, *map(html.paragraph, lines)]
 
 
 def drawn_records(
@@ -98,7 +103,7 @@ def record_sheet(
         Panel(displacements, height=0.75 if time_s is None else 0.5),
         Panel(errors, height=0.35),
     )
-    caption = f"{short_name(record.label)}: measured, and by the {name}."
+    caption = f"{short_name(record.label)}: measurement and {name}."
     return FigureSpec("record", caption, panels, stacked=True)
 
 
@@ -115,16 +120,14 @@ def _some_cycles(command: F64) -> I64:
 def refinement_page(found: Refinement) -> str:
     """Return the page as HTML."""
     after, unit = found.choice.after, found.model.input_unit
-    title = html.text(f"Refined: {', '.join(found.model.provenance.source)}")
     body = [
-        f"<h1>{title}</h1>",
-        *map(html.paragraph, (str(found), *worse_lines(found), after.how)),
+        *_head("Refined model", found.model, [str(found), *worse_lines(found), after.how]),
         "<h2>Errors on runs not fitted</h2>",
-        html.grid(REFINEMENT_HEADINGS, refinement_rows(found), "numbers"),
+        html.grid(REFINEMENT_HEADINGS, refinement_rows(found)),
         "<h2>Errors by stroke</h2>",
-        html.grid(CLASS_HEADINGS, class_rows(found), "numbers"),
+        html.grid(CLASS_HEADINGS, class_rows(found)),
     ]
     for heading, held in (("Before", found.choice.before), ("After", after)):
         body += [f"<h2>{heading}</h2>"]
         body += drawn_records(held.judgement, after.records, unit, MOST_RUNS)
-    return html.document(title, [*body, html.details("Model", dump_model(found.model))])
+    return html.document("Refined model", [*body, html.details("Model", dump_model(found.model))])

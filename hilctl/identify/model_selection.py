@@ -116,8 +116,8 @@ def _together(
         return None
     held_out = tuple(record for fold, _, _ in done for record in fold.held_out)
     responses_um = np.concatenate([modelled for _, modelled, _ in done])
-    parts = "the last parts of histories" if isinstance(held_out[-1], History) else "loops"
-    how = f"{len(held_out)} of {len(request.records)} {parts}, each held out of one fit"
+    parts = "histories (their last parts)" if isinstance(held_out[-1], History) else "loops"
+    how = f"{len(held_out)} of {len(request.records)} {parts}, held out in turn"
     judgement = judgement_of(FitData(held_out, request.unit), responses_um)
     return HeldOut(judgement, held_out, how, done[-1][2])
 

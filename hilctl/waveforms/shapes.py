@@ -7,6 +7,7 @@ from fractions import Fraction
 import numpy as np
 
 from hilctl.base.errors import InputError
+from hilctl.base.formatting import unit_text
 from hilctl.base.types import CHUNK, F64, I64
 from hilctl.waveforms import spec
 
@@ -37,6 +38,7 @@ def check_length(samples: float) -> None:
 
 def outline(w: spec.Shape, unit: str) -> tuple[str, float, float]:
     """Return a waveform's label, its highest frequency in Hz, and its period in s or 0.0."""
+    unit = unit_text(unit)
     match w:
         case spec.Sine() | spec.Triangle() | spec.GrowingOrDecaying():
             label = f"{w.kind} {w.amplitude:g} {unit} {w.frequency_hz:g} Hz"

@@ -142,7 +142,7 @@ def test_a_run_without_real_time_is_the_same_run(tmp_path, staged):
 def test_a_run_with_a_correction_keeps_it_and_replays(tmp_path):
     learned = learn(tmp_path, at(100.0), run=paced, cycles=1)
     recording = read(tmp_path / "run-01.mcap")
-    assert load_correction(tmp_path / "run-01.yaml").cycles[0].label == "sine 40.8 um 100 Hz"
+    assert load_correction(tmp_path / "run-01.yaml").cycles[0].label == "sine 40.8 µm 100 Hz"
     assert recording.correction_yaml == (tmp_path / "run-01.yaml").read_text()
     steady = recording.samples.part(*recording.segments[0].steady_cycles()[:2])
     assert 0.1 < np.abs(steady.input_um - steady.reference_um).max() < 5.0

@@ -217,7 +217,7 @@ class Regularisation:
         modelled = [self._remainder.modelled_um(model, i) for i, model in judged]
         bare = [m[record.ignore :] for m, record in zip(modelled, records, strict=True)]
         data, responses_um = FitData(records, self._unit), np.concatenate(bare)
-        how = f"{len(records)} recordings, each held out of one fit"
+        how = f"{len(records)} recordings, held out in turn"
         if own:
             responses_um = data.with_creep(responses_um)
             how += ", without an offset and creep per recording"

@@ -215,7 +215,7 @@ def _held_out(found: Characterisation) -> list[str]:
         "<h2>Validation errors</h2>",
         html.paragraph(f"Verdict: {found.verdict}. {noise}"),
         *map(html.paragraph, found.verdict.notes if found.verdict else ()),
-        html.grid(HELD_OUT_HEADINGS, held_out_rows(found), "numbers"),
+        html.grid(HELD_OUT_HEADINGS, held_out_rows(found)),
         html.figures(
             [
                 held_out_sheet(first, close=True),
@@ -252,6 +252,6 @@ def _model(found: Characterisation) -> Iterator[str]:
     yield "<h2>Model</h2>"
     yield html.paragraph(fit.model.provenance.method)
     yield from map(html.paragraph, summary(known))
-    yield html.grid(HEADINGS, error_rows(fit.errors), "numbers")
+    yield html.grid(HEADINGS, error_rows(fit.errors))
     yield from drawn_records(fit, known.data, fit.model.input_unit)
     yield html.details("Model file", dump_model(fit.model))

@@ -52,7 +52,7 @@ def series_page(series: RunSeries) -> str:
         html.figures(sheets) if sheets else html.paragraph("No figure applies to these runs."),
         *_trends(series),
         "<h2>Runs</h2>",
-        html.grid(*run_table(series, MOST_ROWS), "numbers"),
+        html.grid(*run_table(series, MOST_ROWS)),
         html.paragraph(f"{left_out} more runs are in the campaign's table.")
         if left_out > 0
         else "",
@@ -127,9 +127,9 @@ def _trends(series: RunSeries) -> Iterator[str]:
             )
             for trend in found
         ]
-        names = ("figure", "against", "at", "slope", "offset", "r²", "direction")
+        names = ("metric", "against", "at", "slope", "offset", "r²", "direction")
         yield "<h2>Linear fits</h2>"
-        yield html.grid(names, rows, "numbers")
+        yield html.grid(names, rows)
 
 
 def fitted_trends(series: RunSeries) -> Iterator[Trend]:

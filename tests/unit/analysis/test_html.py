@@ -67,3 +67,11 @@ def test_a_page_s_figure_has_texts_of_any_width_and_no_address(figure):
 
 def test_the_same_figure_has_the_same_bytes(figure):
     assert html.svg(figure, "loop") == html.svg(figure, "loop")
+
+
+def test_a_table_shows_the_kind_of_each_column():
+    table = ET.fromstring(
+        html.grid(["at", "ms", "file"], [["1 A", "-", "a-1"], ["", "2e-05", "b"]])
+    )
+    assert [cell.attrib["class"] for cell in table.iter("th")] == ["text", "number", "word"]
+    assert len(table.findall("table/thead")) == 1

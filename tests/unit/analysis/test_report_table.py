@@ -30,7 +30,7 @@ def test_unknown_figures_are_dashes(report):
     assert "timing" not in rows
     assert dict(run_rows(replace(report, deadline_misses="3 of 5")))["timing"] == "3 of 5"
     assert (rows["device"], rows["ended"]) == ("-", "-")
-    assert dict(run_rows(replace(report, device_description="X 1")))["device is"] == "X 1"
+    assert dict(run_rows(replace(report, device_description="X 1")))["device description"] == "X 1"
     assert dict(run_rows(replace(unknown, complete=False)))["ended"] == "- (NOT complete)"
 
 

@@ -244,7 +244,7 @@ def test_it_says_when_by_whom_with_what_and_what_was_wanted(described):
     assert (rows["operator"], rows["sample"]) == ("Ada\\x1b", "A7")
     assert rows["device"].startswith("serial_dac (simulated")
     assert rows["waveform"] == "sine 40.8 um"
-    assert rows["its settings"] == "amplitude 40.8, unit um"
+    assert rows["waveform settings"] == "amplitude 40.8, unit µm"
     assert rows["limits"] == "peak_current_a 7.07"
     assert rows["overrides"] == "waveform.amplitude=40.8"
     assert rows["model error"] == model_error(load_model(MODEL))

@@ -99,7 +99,7 @@ def test_only_the_waveform_that_was_learned_is_corrected(tmp_path):
 def test_another_waveform_is_refused(other, tmp_path):
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0])
-    with pytest.raises(InputError, match=r"sine 10 um 150 Hz"):
+    with pytest.raises(InputError, match=r"sine 10 µm 150 Hz"):
         correction.added(reference(other, tmp_path), None)
 
 
