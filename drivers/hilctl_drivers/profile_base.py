@@ -40,9 +40,7 @@ class LinkSettings(StrictModel):
 class StreamSettings(LinkSettings):
     """Settings of a link whose replies have no number."""
 
-    echo: bool = Field(
-        default=False, description="whether each request comes back before its reply"
-    )
+    echo: bool = Field(default=False, description="whether each request is echoed before its reply")
     gap_s: float | None = Field(default=None, ge=0.0, description="silence before each request, s")
 
     @property

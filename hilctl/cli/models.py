@@ -57,7 +57,7 @@ IdentifyInput = Annotated[
 TableUnit = Annotated[str | None, typer.Option(help="Unit of the command in a table, A or V.")]
 TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
 TableScale = Annotated[
-    float | None, typer.Option(help="Factor from a table's column to um, or to the command's unit.")
+    float | None, typer.Option(help="Factor from a table's column to µm, or to the command's unit.")
 ]
 SkipRows = Annotated[
     int | None, typer.Option(min=0, help="Lines at the start of a text table to skip.")

@@ -196,7 +196,7 @@ def _suggestions(
         share = f"{-constant:.3g} µm, {shown:.1f} % of the stroke"
         yield f"most of the error is a constant, {share}{hint}"
     if stroke_um > LIKELY_UM:
-        yield f"a stroke of {stroke_um:.3g} µm is large. Is the displacement in um?"
+        yield f"a stroke of {stroke_um:.3g} µm is large. Is the displacement in µm?"
 
 
 def _explained(fit: FittedModel, records: Sequence[Record]) -> float:

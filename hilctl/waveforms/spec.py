@@ -282,7 +282,7 @@ class Sequence(StrictModel):
     parts: Annotated[tuple[SinglePart, ...], NotEmpty, AtLeastOne] = Field(
         description="waveforms in order"
     )
-    repeat: int = Field(default=1, ge=1, le=10_000, description="number of times they are played")
+    repeat: int = Field(default=1, ge=1, le=10_000, description="number of repetitions")
 
     @field_validator("parts")
     @classmethod

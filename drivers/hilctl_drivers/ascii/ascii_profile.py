@@ -320,7 +320,7 @@ class AsciiProfile(BaseProfile):
         link: Serial line or TCP connection.
         outputs: Outputs by name.
         inputs: Inputs by name.
-        exchange: Lines that write and read in one go; none if there are none.
+        exchange: Lines that write and read in one transaction; none if there are none.
         init: Steps after the device is identified.
         close: Steps before the port is closed.
         watchdog: Host watchdog; none if it has none.

@@ -21,14 +21,16 @@ class FramesLink(BinaryLineSettings):
     )
     crc: CrcName = Field(description="check after the payload, least significant byte first")
     payload_max: int = Field(default=4096, ge=8, le=4096, description="longest payload, bytes")
-    usb: bool = Field(description="a USB device: baud means nothing, frames pass in USB frames")
+    usb: bool = Field(
+        description="whether it is on USB: baud has no effect, and bytes wait for USB frames"
+    )
     usb_frame_s: float = Field(
         default=1e-3, gt=0.0, description="time between USB frames, s: 1 ms full, 125 us high speed"
     )
 
 
 class FrameChannel(Range):
-    """A DAC or ADC of a board: how its values stand in a message."""
+    """A DAC or ADC of a board: encoding of its values in a message."""
 
     type: RegisterType = Field(description="how a raw value is stored")
     order: str = Field(default="", description="as in a register; DCBA is least significant first")
@@ -53,7 +55,7 @@ class FrameChannel(Range):
 
 
 class FrameStreaming(StrictModel):
-    """A sample clock and a FIFO of the board's own."""
+    """Sample clock and FIFO of the board."""
 
     fifo_depth: int = Field(ge=2, le=65535, description="samples that its FIFO holds")
     block_max: int = Field(ge=1, le=4096, description="most samples of one message")

@@ -42,7 +42,7 @@ _LOST = {
 
 
 class SimulatedFault(StrictModel):
-    """A fault to inject, permanent from its sample on, to try the reaction of a run."""
+    """A fault to inject, permanent from its sample on, to test the reaction of a run."""
 
     kind: Literal[
         "sensor_nan", "sensor_frozen", "sensor_jump", "sensor_inverted", "no_answer", "refused"
@@ -50,7 +50,7 @@ class SimulatedFault(StrictModel):
         description="sensor_nan: readings are not numbers; sensor_frozen: the last good reading"
         " is repeated; sensor_jump: readings are off by half the sensor's range; sensor_inverted:"
         " readings have the other sign; no_answer: exchanges time out; refused: exchanges are"
-        " turned down"
+        " refused"
     )
     at_sample: int = Field(ge=0, description="first sample that has the fault")
 
@@ -63,8 +63,8 @@ class SimulatedOptions(DeviceOptions):
     fault: SimulatedFault | None = Field(default=None, description="fault to inject")
     output_at_open: float | None = Field(
         default=0.0,
-        description="where the output stands when the device is opened, in its unit; null where the"
-        " device is not to know, and then it is 0",
+        description="output when the device is opened, in its unit; null for 0 and a device that"
+        " does not report it",
     )
 
 
@@ -105,7 +105,7 @@ class SimulatedDevice(DacDevice):
         return FIFO_DEPTH, ""
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
-        """Put the plant at rest where the output stands, with the sample count at 0."""
+        """Put the plant at rest at the present output, with the sample count at 0."""
         del block
         self._plant = self.plant(sample_rate_hz)
         self._next_sample = 0
@@ -189,7 +189,7 @@ Factor: TypeAlias = Annotated[float, Field(ge=0.5, le=2.0)]
 
 
 class Variation(DeviceOptions):
-    """Factors on the rated actuator, to try what a model of another one is still good for."""
+    """Factors on the rated actuator, to test a model of another actuator."""
 
     lag: Factor = Field(default=1.0, description="time constant of the field")
     pinning: Factor = Field(default=1.0, description="pinning fields, the width of the loops")
@@ -210,7 +210,7 @@ class Variation(DeviceOptions):
 class Drift(DeviceOptions):
     """Slow growth of the displacement, as of rods that warm up: ``um * (1 - exp(-t / tau_s))``."""
 
-    um: float = Field(ge=-50.0, le=50.0, description="displacement that it comes to, um")
+    um: float = Field(ge=-50.0, le=50.0, description="final displacement, um")
     tau_s: float = Field(gt=0.0, description="its time constant, s")
 
 
@@ -219,7 +219,7 @@ class TerfenolOptions(SimulatedOptions):
 
     physics: Physics = Field(
         default="pinned_cells",
-        description="what goes on in the rods; pinned_cells: cells with dry friction behind one lag"
+        description="physics of the rods; pinned_cells: cells with dry friction behind one lag"
         " of the field; domains: domains of eight orientations, averaged over their energies;"
         " diffusion: the field diffuses into conducting rods, shell by shell;"
         " jiles_atherton: Jiles and Atherton's equations with eddy and excess loss;"
@@ -235,7 +235,7 @@ class TerfenolOptions(SimulatedOptions):
         default=0.0,
         ge=-8.0,
         le=8.0,
-        description="constant current beside the command, A; displacement is zero there",
+        description="constant current added to the command, A; displacement is zero there",
     )
     current_max_a: float = Field(
         default=10.0,

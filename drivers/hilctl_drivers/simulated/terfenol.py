@@ -119,7 +119,7 @@ class CreepEffect(DeviceOptions):
     """
 
     share: float = Field(
-        gt=0.0, le=0.3, description="creep that all time constants come to, per displacement"
+        gt=0.0, le=0.3, description="final creep of all time constants together, per displacement"
     )
     time_constants_s: tuple[TimeConstant, ...] = Field(
         default=(0.1, 1.0, 10.0, 100.0),
@@ -130,10 +130,10 @@ class CreepEffect(DeviceOptions):
 
 
 class Thermal(DeviceOptions):
-    """Growth of rods that the coil's own I^2 R warms, and that stand in a room."""
+    """Thermal expansion of the rods, which the coil's I^2 R heats and the room cools."""
 
     rise_k_per_a2: float = Field(
-        ge=0.0, le=10.0, description="rise that a steady current comes to, per its square, K/A^2"
+        ge=0.0, le=10.0, description="final rise at a steady current, per its square, K/A^2"
     )
     tau_s: float = Field(ge=0.1, le=1e5, description="time constant of the rise, s")
     growth_um_per_k: float = Field(
@@ -143,25 +143,25 @@ class Thermal(DeviceOptions):
         default=0.0,
         ge=-20.0,
         le=20.0,
-        description="temperature of the room above that at which the sensor was set to zero, K",
+        description="temperature of the room relative to that at which the sensor was zeroed, K",
     )
 
 
 class SecondMode(DeviceOptions):
-    """A second mode of the structure, which stays where it is with any load."""
+    """A second mode of the structure, whose frequency does not depend on the load."""
 
     frequency_hz: float = Field(ge=50.0, le=20e3, description="its natural frequency, Hz")
     damping_ratio: float = Field(ge=0.001, le=1.0, description="its damping ratio")
     share: float = Field(
         ge=-0.5,
         le=0.5,
-        description="its share of the static displacement; negative where it moves the head against"
+        description="its share of the static displacement; negative if it moves the head against"
         " the first",
     )
 
 
 class VoltageLimit(DeviceOptions):
-    """An amplifier whose voltage is limited: no current changes faster than that drives it.
+    """A limit of the amplifier's voltage, which limits the slew of the current.
 
     The voltages that moving rods induce are omitted.
     """

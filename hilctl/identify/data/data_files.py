@@ -92,7 +92,7 @@ def _check_stroke(path: Path, history: History) -> None:
     if move_um < SMALLEST_UM and abs(correlation(history.command, history)) > FOLLOWS:
         raise DataError(
             f"{path}: the displacement moves by {move_um:.3g} µm only: set --displacement-scale "
-            "1000 if it is in mm, or --displacement-scale 1 if it is in um"
+            "1000 if it is in mm, or --displacement-scale 1 if it is in µm"
         )
 
 

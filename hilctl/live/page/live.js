@@ -137,7 +137,7 @@ function showStatus() {
   const disk = status.disk
     ? `${bytes(status.disk.recorded_bytes)} recorded, ${bytes(status.disk.free_bytes)} free on disk · ` : "";
   $("room").textContent = `${disk}ring ${(100 * status.ring_used).toFixed(0)} % full · `
-    + `${status.missed_samples} samples not seen`;
+    + `${status.missed_samples} samples not shown`;
   $("stop").disabled = status.ended;
   $("report").hidden = !status.ended;
   if (status.ended) notice(`Run ended: ${status.reason || status.state}${safeText()}`, endKind());
