@@ -22,7 +22,9 @@ def _inline(writer: Any, node: nodes.math) -> None:
 
 
 def _displayed(writer: Any, node: nodes.math_block) -> None:
-    writer.body.append(f'<div class="equation">{_mathml(node.astext(), as_block=True)}</div>')
+    writer.body.append(
+        f'<div class="equation" tabindex="0">{_mathml(node.astext(), as_block=True)}</div>'
+    )
     raise nodes.SkipNode
 
 

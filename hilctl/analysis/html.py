@@ -58,7 +58,7 @@ th, td { text-align: left; vertical-align: top; padding: .2rem .9rem .2rem 0;
 th { font-weight: 600; white-space: nowrap; }
 td { font-variant-numeric: tabular-nums; }
 section td { overflow-wrap: anywhere; }
-.number { text-align: right; padding-right: .6rem; }
+.number { text-align: right; }
 td.number, td.word { white-space: nowrap; }
 pre { background: var(--pale); padding: .8rem; overflow-x: auto; font-size: .87rem; }
 summary { cursor: pointer; }
@@ -66,7 +66,7 @@ dt { font-weight: 600; break-after: avoid; } dd { margin: 0 0 .4rem 1rem; break-
 .wide { overflow-x: auto; }
 .wide th { white-space: normal; }
 @page { margin: 12mm; }
-@media print { html { font-size: 9pt; } body { max-width: none; padding: 0; }
+@media print { html { font-size: 8.5pt; } body { max-width: none; padding: 0; }
   .figures, .side { columns: 2; column-gap: 5mm; } .figures svg { max-width: 68mm; }
   h2 { break-after: avoid; } tr { break-inside: avoid; }
   .wide { overflow: visible; } details { display: none; } }

@@ -133,7 +133,7 @@ def before_and_after(before: Recording, after: Recording) -> FigureSpec | None:
             axes.plot(x, y - off_line * x, color=colour, linewidth=1.0, label=label)
         straight = [0.0, 100.0 * (1.0 - off_line)]
         axes.plot([0.0, 100.0], straight, color=REFERENCE, linestyle=":", linewidth=0.8)
-        name = "deviation, % of range" if off_line else "displacement, % of its range"
+        name = "deviation, % of its range" if off_line else "displacement, % of its range"
         axes.set(xlabel="input, % of its range", ylabel=name)
 
     panels = (
