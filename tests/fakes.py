@@ -97,6 +97,7 @@ class FakeInfo:
     """Device info for the loop."""
 
     measures_command: bool = False
+    ages_readings: bool = False
     simulated: bool = False
     confirms: bool = True
     arm_s: float = 0.0

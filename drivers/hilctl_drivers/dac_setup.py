@@ -4,10 +4,11 @@ The sensor is read by the device with the output or by another one, the reader, 
 reader has a link of its own, or shares the line or connection of the output.
 """
 
+import math
 from abc import ABC, abstractmethod
 from dataclasses import dataclass, replace
 from pkgutil import resolve_name
-from typing import Any, Self, cast
+from typing import Any, ClassVar, Self, cast
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
@@ -151,6 +152,7 @@ class DacSetup:
             description=description,
             holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
             details=details,
+            ages_readings=self._reader_class.AGES,
             **more,
         )
 
@@ -162,18 +164,28 @@ class SensorReader(ABC):
     finished here. It has a link of its own, or shares that of the output.
     """
 
+    AGES: ClassVar[bool] = False
+    """Whether the device sends unasked, so that its readings have an age."""
+    age_s = math.nan
+    """Age of the last reading, if it has one."""
+
     def __init__(self, setup: DacSetup, link: Link) -> None:
         """Take the output's link; nothing is sent before :meth:`open`."""
         self._name = setup.reader_name
-        self._own = None
+        self._own: Any = None
         if setup.reads_elsewhere and not setup.shares_link:
-            self._own = setup.reader.link()
+            self._own = self._new_link(setup.reader)
         self._link: Link = self._own or link
 
     @staticmethod
     @abstractmethod
     def time(profile: Any, source: Any) -> WireTime:
         """Return the time of reading an input."""
+
+    @property
+    def lost(self) -> int:
+        """Number of readings since :meth:`start` that did not arrive, if they are counted."""
+        return 0
 
     def open(self) -> None:
         """Connect and identify the device."""
@@ -190,6 +202,9 @@ class SensorReader(ABC):
                 self._set_up()
                 self._read()
 
+    def start(self) -> None:  # noqa: B027  most devices send nothing unasked
+        """Discard what has arrived before the first exchange."""
+
     def read(self) -> float:
         """Return the value of the input in its unit."""
         with naming(self._name):
@@ -205,6 +220,10 @@ class SensorReader(ABC):
         """Close its own link."""
         if self._own is not None:
             self._own.close()
+
+    def _new_link(self, reader: Endpoint) -> Any:
+        """Return a link to the device, with ``open`` and ``close``."""
+        return reader.link()
 
     @abstractmethod
     def _identify(self) -> None:

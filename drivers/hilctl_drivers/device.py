@@ -7,10 +7,11 @@ exchanges and disconnects.
 """
 
 import json
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import Any, ClassVar
+from typing import TYPE_CHECKING, Any, ClassVar
 
 import numpy as np
 
@@ -18,6 +19,9 @@ from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl.base.types import F64
 from hilctl_drivers.transport.wire_time import RateLimit
+
+if TYPE_CHECKING:  # it imports this module
+    from hilctl_drivers.dac_setup import SensorReader
 
 _SHORT = 64
 
@@ -33,6 +37,7 @@ class DacDevice(ABC):
     """
 
     Options: ClassVar[type[DeviceOptions]]
+    _reader: "SensorReader | None" = None
 
     def __init__(self, info: DeviceInfo, title: str, action: str, output: str) -> None:
         self._info = info
@@ -43,6 +48,16 @@ class DacDevice(ABC):
         self._block = 0  # samples in each exchange; 0 while it is not open
         self.transactions = 0
         """Requests of one exchange, known once it is open; 0 if it sends none."""
+
+    @property
+    def reading_age_s(self) -> float:
+        """See :attr:`hilctl.base.device.AgingDevice.reading_age_s`."""
+        return math.nan if self._reader is None else self._reader.age_s
+
+    @property
+    def lost_readings(self) -> int:
+        """See :attr:`hilctl.base.device.AgingDevice.lost_readings`."""
+        return 0 if self._reader is None else self._reader.lost
 
     @property
     def info(self) -> DeviceInfo:
@@ -68,6 +83,7 @@ class DacDevice(ABC):
         except DeviceError as error:
             raise self._failed("open", error, self._release) from None
         self._block = block
+        self.transactions -= self._info.ages_readings  # no request to a sensor that sends unasked
         if self.transactions:
             details = {**self._info.details, "transactions": str(self.transactions)}
             self._info = replace(self._info, details=details)
@@ -79,6 +95,8 @@ class DacDevice(ABC):
             raise self._error(action, "not open")
         try:
             self._arm()
+            if self._reader is not None:
+                self._reader.start()
         except DeviceError as error:
             raise self._failed(action, error, self._abandon) from None
 

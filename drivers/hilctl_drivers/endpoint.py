@@ -5,12 +5,14 @@ from dataclasses import dataclass, replace
 from hilctl.base.errors import InputError
 from hilctl_drivers.profile import check_baud, with_link
 from hilctl_drivers.profile_base import BaseProfile, SerialLineSettings, StreamSettings
-from hilctl_drivers.signal_chain import LINE, PORT, AddressOptions, DacOptions
+from hilctl_drivers.signal_chain import LINE, PORT, STREAM, AddressOptions, DacOptions
 from hilctl_drivers.transport.links import Link
 from hilctl_drivers.transport.resource_names import held_address, held_port
 from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.tcp import TcpLink, TcpStream
+
+_OF_LINK = (*LINE, *PORT, *STREAM)
 
 
 @dataclass(frozen=True, slots=True)
@@ -51,7 +53,7 @@ class Endpoint:
             raise InputError(f"{above}tcp_port is required: profile {name} has none")
         return cls(
             name=name,
-            profile=with_link(profile, **{key: getattr(options, key) for key in (*LINE, *PORT)}),
+            profile=with_link(profile, **{key: getattr(options, key) for key in _OF_LINK}),
             unit=profile.usual_unit if options.unit_id is None else options.unit_id,
             host=host,
             port=port,
@@ -98,10 +100,10 @@ def _check_keys(options: AddressOptions, above: str) -> None:
     name, profile = options.profile.name, options.profile.profile
     if not options.host and not isinstance(profile.link, SerialLineSettings):
         raise InputError(f"profile {name} is for TCP: give {above}host, not serial_port")
-    given = [key for key in (*LINE, *PORT) if getattr(options, key) is not None]
+    given = [key for key in _OF_LINK if getattr(options, key) is not None]
     lacking = [f"{above}{key}" for key in given if key not in type(profile.link).model_fields]
     if lacking:
-        raise InputError(f"{', '.join(lacking)} must be omitted: {profile.title} has no line")
+        raise InputError(f"{', '.join(lacking)} must be omitted with profile {name}")
     if options.unit_id is not None and profile.usual_unit is None:
         raise InputError(f"{above}unit_id must be omitted: {profile.title} has no address")
     if options.framing is not None and options.framing not in profile.framings:

@@ -149,6 +149,11 @@ class Range(StrictModel):
         return self.min, self.max
 
     @property
+    def rest(self) -> float:
+        """Value of a position at rest, in ``unit``: 0, or the middle of a range that ends at 0."""
+        return 0.0 if self.min < 0.0 < self.max else 0.5 * (self.min + self.max)
+
+    @property
     def step(self) -> float:
         """Smallest step in ``unit``; a thousandth of the range if the profile does not say."""
         return self.resolution or _USUAL_STEP * (self.max - self.min)

@@ -12,7 +12,7 @@ from typing import ClassVar
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
-from hilctl_drivers.dac_setup import DacSetup, SensorReader
+from hilctl_drivers.dac_setup import DacSetup
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, Measure
 from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back
@@ -47,8 +47,10 @@ class SerialDac(DacDevice):
         profile = options.profile.profile
         driver = profile.driver
         if not driver:
-            name, kind = options.profile.name, profile.DEVICE
-            raise InputError(f"profile {name} is one for kind: {kind}, not serial_dac")
+            rule = f"is one for kind: {profile.DEVICE}, not serial_dac"
+            if not profile.outputs:
+                rule = "has no output: name it as device.reader"
+            raise InputError(f"profile {options.profile.name} {rule}")
         made: SerialDac = object.__new__(resolve_name(driver) if cls is SerialDac else cls)
         return made
 
@@ -62,7 +64,6 @@ class SerialDac(DacDevice):
         self._setup = setup = DacSetup.of(options)
         self._chain = setup.chain
         self._link = setup.writer.stream()
-        self._reader: SensorReader | None = None
         self._safe_exchange = SafeExchange()
         self._prepare()
         title = f"serial_dac {setup.writer.name} at {setup.writer.place}"

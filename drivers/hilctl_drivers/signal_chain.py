@@ -172,6 +172,8 @@ LINE = ("baud", "parity", "stopbits", "echo", "gap_s")
 """Settings of a serial line, at a port of this machine or behind a gateway or serial server."""
 PORT = ("boot_wait_s", "dtr", "rts", "rs485")
 """Settings of a serial port of this machine."""
+STREAM = ("max_age_s",)
+"""Settings of a sensor that sends unasked."""
 
 
 class AddressOptions(DeviceOptions):
@@ -215,6 +217,12 @@ class AddressOptions(DeviceOptions):
     )  # fmt: skip
     dtr: bool | None = Field(default=None, description="level of DTR; default: the profile's")
     rts: bool | None = Field(default=None, description="level of RTS; default: the profile's")
+    max_age_s: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="age from which a reading of a sensor that sends unasked is invalid, s;"
+        " default: the profile's",
+    )
     rs485: Literal["high", "low"] | None = Field(
         default=None,
         description="level of RTS while sending, switched by the kernel (TIOCSRS485); omitted if"
@@ -228,7 +236,7 @@ class AddressOptions(DeviceOptions):
         places = {
             "host": (self.host, ("tcp_port", "framing")),
             "serial_port": (self.serial_port, PORT),
-            "serial_port or host": (self.serial_port or self.host, LINE),
+            "serial_port or host": (self.serial_port or self.host, (*LINE, *STREAM)),
         }
         wrong = [
             f"{', '.join(given)} must go with {name}"

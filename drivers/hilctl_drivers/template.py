@@ -172,8 +172,8 @@ def _sensor(made: StartingSection, sensor_input: Range) -> None:
     if sensor_input.unit == "A":
         raise InputError(f"{made.values['input']} is in A: no displacement sensor gives that")
     at_zero = f"displacement at 0 {sensor_input.unit}, um"
-    if sensor_input.per_unit("um"):
-        made.values["sensor"] = {"offset_um": 0.0}
+    if um_per_unit := sensor_input.per_unit("um"):
+        made.values["sensor"] = {"offset_um": 0.0 - um_per_unit * sensor_input.rest}
     else:
         key = f"um_per_{sensor_input.unit.lower()}"
         middle = 0.5 * (sensor_input.min + sensor_input.max)

@@ -39,6 +39,7 @@ class DeviceInfo:
             same exchange; more for a device that plays blocks from a FIFO and sets the pace:
             :meth:`Device.exchange` then waits for its clock.
         measures_command: Whether :meth:`Device.exchange` fills ``measured``.
+        ages_readings: Whether the device is an :class:`AgingDevice`: its sensor sends unasked.
         holds: Resources that it uses exclusively while open, with a name common to all devices
             (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``). Empty for a device without such a
             resource.
@@ -71,6 +72,7 @@ class DeviceInfo:
     fifo_depth: int = 0
     latency_blocks: int = 0
     measures_command: bool = False
+    ages_readings: bool = False
     holds: tuple[str, ...] = ()
     simulated: bool = False
     watchdog_command: float | None = None
@@ -237,6 +239,20 @@ class ReadableDevice(Protocol):
             DeviceError: The device is open, cannot be reached, is another device, or answers
                 wrongly.
         """
+        ...
+
+
+class AgingDevice(Protocol):
+    """A device whose sensor sends unasked, so that a reading is older than the exchange."""
+
+    @property
+    def reading_age_s(self) -> float:
+        """Age of the last exchange's displacement; NaN if none has arrived yet."""
+        ...
+
+    @property
+    def lost_readings(self) -> int:
+        """Readings since :meth:`WatchdogDevice.arm` that did not arrive."""
         ...
 
 

@@ -37,6 +37,12 @@ ADAPTED = "adapted"
 Values: ``offset_um``, ``gain``, and the weights of the operator, see ``loop/adaptation.py``.
 """
 
+LOST_READINGS = "lost_readings"
+"""Event code at the end of a run in which readings of a sensor that sends unasked did not arrive.
+
+Values: ``readings``, their number.
+"""
+
 
 @dataclass(frozen=True, slots=True)
 class Event:

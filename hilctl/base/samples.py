@@ -17,9 +17,9 @@ LAST_SAMPLE = 2**40
 LONGEST_NS = 2**60
 """Above every time of a tick since the start of the machine."""
 
-WhenRecorded: TypeAlias = Literal["always", "measured", "own_input"]
+WhenRecorded: TypeAlias = Literal["always", "measured", "own_input", "aged"]
 """``measured``: if the device measures its command; ``own_input``: if the compensator's input
-differs from the reference."""
+differs from the reference; ``aged``: if the sensor sends unasked."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +136,15 @@ class Samples:
             in_waveform_unit=True,
         ),
     ]
+    reading_age_s: Annotated[
+        F64,
+        SampleColumn(
+            "time since the displacement arrived from a sensor that sends unasked; NaN before that",
+            RecordedField("reading_age_s", "s", block=17, before=18),
+            when="aged",
+            answered=True,
+        ),
+    ] = field(default_factory=_empty)
     flags: U32
 
     @classmethod

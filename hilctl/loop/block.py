@@ -27,6 +27,7 @@ class Block:
         displacement_um: Filled by the device: float64[B].
         measured: Measured command, filled by the device if it has one: float64[B].
         input_um: The compensator's input: float64[B]; in the waveform's unit without a model.
+        reading_age_s: Age of the displacement, if the sensor sends unasked: float64[B].
     """
 
     def __init__(self, head: "memoryview[int]", area: BlockBatch, slot: int) -> None:
@@ -44,4 +45,5 @@ class Block:
             self.displacement_um,
             self.measured,
             self.input_um,
+            self.reading_age_s,
         ) = self.columns

@@ -12,13 +12,14 @@ the ramp the loop repeats the safe value until the last answer has arrived.
 import math
 from collections import deque
 from enum import Enum
+from typing import cast
 
 import numpy as np
 
-from hilctl.base.device import Device, WatchdogDevice
+from hilctl.base.device import AgingDevice, Device, WatchdogDevice
 from hilctl.base.errors import DeviceError
-from hilctl.base.events import OFFSET, Event
-from hilctl.base.samples import BlockHeader, Flag
+from hilctl.base.events import LOST_READINGS, OFFSET, Event
+from hilctl.base.samples import ANSWERS, BlockHeader, Flag
 from hilctl.base.types import F64, U32
 from hilctl.loop.block import Block
 from hilctl.loop.interlocks import Interlocks, Trip
@@ -70,6 +71,7 @@ class Loop:
         period_ns = plan.block / plan.sample_rate_hz * 1e9
         self._plan = plan
         self._device = device
+        self._aging = cast(AgingDevice, device) if device.info.ages_readings else None
         self._host = host
         self._clock = host.clock
         self._compensator = plan.compensator
@@ -141,6 +143,7 @@ class Loop:
         except DeviceError as error:
             return self._lost_device(error)
         self._record_adapted(ended=True)
+        self._record_lost_readings()
         output: OutputState = "confirmed" if self._device.info.confirms else "sent"
         return LoopOutcome(self._code, self._reason, self._ended_at, output, self._dropped)
 
@@ -328,6 +331,8 @@ class Loop:
             head[_FIRST_SAMPLE], sent.command, answered.displacement_um, answered.measured
         )
         head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
+        if self._aging is not None:
+            answered.reading_age_s[:] = self._aging.reading_age_s
         if not early:
             in_flight.popleft()
             self._process_answer(answered, self._interlocks.judge(answered))
@@ -428,6 +433,12 @@ class Loop:
         if event := adaptation.event(sample, ended=ended):
             self._host.record_event(event)
 
+    def _record_lost_readings(self) -> None:
+        if self._aging is not None and (lost := self._aging.lost_readings):
+            text = f"{lost} readings of the sensor did not arrive"
+            event = Event(self._next_sample, "warning", LOST_READINGS, text, {"readings": lost})
+            self._host.record_event(event)
+
     def _drain(self) -> None:
         """Repeat the safe value for one block to receive an outstanding answer."""
         block = self._reserve(self._wait(), due=False)
@@ -439,6 +450,7 @@ class Loop:
         text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
         event = Event(self._next_sample, "error", "device_lost", str(error))
         self._host.record_event(event)
+        self._record_lost_readings()
         # Before the device is used: its timeouts would look like a hang to the supervisor.
         self._host.closing()
         limits = self._limiter.limits
@@ -452,7 +464,7 @@ class Loop:
             text += f"; {describe(output.state, output.error)}"
         for block in self._in_flight:
             if block.due:
-                block.displacement_um[:] = block.measured[:] = np.nan
+                block.columns[ANSWERS] = np.nan
                 block.flags |= (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
                 self._record(block)
         self._record_adapted(ended=True)

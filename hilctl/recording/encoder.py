@@ -46,6 +46,7 @@ class RecordingLayout:
         scope_rate_hz: Highest rate of ``/scope``.
         start_unix_ns: Unix time of sample 0 in ns.
         records_input: Whether the compensator's input differs from the reference.
+        ages_readings: Whether the sensor sends unasked, so that its readings have an age.
         waveform_unit: ``um``, or the command unit without a compensator.
     """
 
@@ -56,6 +57,7 @@ class RecordingLayout:
     start_unix_ns: int
     records_input: bool = False
     waveform_unit: str = "um"
+    ages_readings: bool = False
 
     def __post_init__(self) -> None:
         """Check rates and clock; times in ns exceed 64 bits after 2260."""
@@ -71,7 +73,11 @@ class RecordingLayout:
 
     def records(self, column: SampleColumn) -> bool:
         """Return whether a column is recorded."""
-        given = {"measured": self.measures_command, "own_input": self.records_input}
+        given = {
+            "measured": self.measures_command,
+            "own_input": self.records_input,
+            "aged": self.ages_readings,
+        }
         return given.get(column.when, True)
 
     def recorded(self, samples: Samples | BlockBatch) -> Iterator[tuple[RecordedField, F64]]:
@@ -116,6 +122,7 @@ class RecordingLayout:
                 # Older recordings do not have these.
                 records_input=facts.get("records_input") == "true",
                 waveform_unit=facts.get("waveform_unit", "um"),
+                ages_readings=facts.get("ages_readings") == "true",
             )
         except (KeyError, ValueError, InputError) as error:
             raise DataError(f"metadata hilctl.run: missing or damaged: {error}") from None

@@ -228,7 +228,8 @@ def _samples(index: I64, flags: U32, unit: CommandUnit, values_of: Callable[[str
         values = values_of(field)
         if not values.size and column.otherwise:
             values = columns[column.otherwise]
-        if values.size not in {index.size} | ({0} if column.when == "measured" else set()):
+        sizes = {index.size} | ({0} if column.when in {"measured", "aged"} else set())
+        if values.size not in sizes:
             counted = f"{values.size} values of {field} for {index.size} samples"
             raise DataError(f"/samples: {counted}, commands in {unit}")
         columns[name] = values

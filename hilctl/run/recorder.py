@@ -240,6 +240,7 @@ class Recorder:
                 start_unix_ns=start_unix_ns,
                 records_input=self._checked.records_input,
                 waveform_unit=self._checked.reference.unit,
+                ages_readings=info.ages_readings,
             ),
         )
 

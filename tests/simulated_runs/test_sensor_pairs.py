@@ -1,8 +1,11 @@
 """Output and sensor on devices of different protocols, over every kind of link, sample by sample.
 
-The emulator's time stands still during an exchange, so each reading is known.
+The emulator's time stands still during an exchange, so each reading is known. A sensor that sends
+unasked needs time that passes; there the age tells which block was read.
 """
 
+import time
+from bisect import bisect_right
 from pathlib import Path
 
 import numpy as np
@@ -12,7 +15,7 @@ from hilctl.experiment.devices import device_class
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from hilctl_drivers.simulated.devices import TerfenolOptions
-from tests.fakes import ManualClock, emulated, logged
+from tests.fakes import ManualClock, ShiftedClock, emulated, logged
 
 SAMPLES = 2000
 STILL = TerfenolOptions(noise=False)
@@ -50,6 +53,7 @@ PAIRS = {
     ),
     "board with text over TCP": ("cobs_board", {"reader": "gcs"}),
     "Modbus RTU with a board": ("icp_m7024", {"reader": "cobs_board"}),
+    "text with a stream": ("kepco_bop", {"reader": "capancdt_6200"}),
 }  # fmt: skip
 
 
@@ -60,10 +64,40 @@ def profile(tmp_path):
     def of(name):
         text = GCS if name == "gcs" else shipped_profiles()[name].read_text()
         path = tmp_path / f"{name}.yaml"
-        path.write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
+        text = text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0")
+        path.write_text(text.replace("max_age_s: 0.02", f"max_age_s: {PATIENT_S}"))
         return str(path)
 
     return of
+
+
+class SentBlocks:
+    """Times and readings of the blocks that an emulated sensor sends unasked."""
+
+    def __init__(self, reader):
+        self.sent_ns, self.shown_um = [], []
+        self._reader, self._block, self._complete = reader, reader.block, 0
+        reader.block = self._keep
+
+    def _keep(self, now_ns):
+        data = self._block(now_ns)
+        self.sent_ns.append(time.monotonic_ns())
+        self.shown_um.append(self._reader._rig.displacement_um)
+        return data
+
+    def last_read_um(self, device, before_ns):
+        """Return the reading of the block that an exchange since ``before_ns`` must have read.
+
+        All blocks of before the previous exchange have arrived.
+        """
+        arrived_ns = device._reader._arrived_ns
+        at_ns = arrived_ns + round(1e9 * device.reading_age_s)
+        assert before_ns <= at_ns + 1
+        assert at_ns <= time.monotonic_ns() + 1
+        number = bisect_right(self.sent_ns, arrived_ns) - 1
+        assert number >= self._complete
+        self._complete = bisect_right(self.sent_ns, before_ns) - 2
+        return self.shown_um[number]
 
 
 @pytest.mark.parametrize("name", PAIRS)
@@ -71,9 +105,11 @@ def test_all_commands_and_readings_are_those_of_the_devices(profile, tmp_path, n
     output, options = PAIRS[name]
     if "reader" in options:
         options = {**options, "reader": profile(options["reader"])}
-    log, clock = tmp_path / "log.jsonl", ManualClock()
+    streams = name == "text with a stream"
+    log, clock = tmp_path / "log.jsonl", ShiftedClock() if streams else ManualClock()
     path = profile(output)
     with emulated(EmulatorOptions(path, log=log, actuator=STILL, **options), clock) as emulator:
+        blocks = SentBlocks(emulator.reader) if streams else None
         keys = {**emulator.options, "timeout_s": PATIENT_S}
         for section in (keys, keys.get("reader")):
             placed = section and {"host", "serial_port"} & section.keys()
@@ -87,12 +123,16 @@ def test_all_commands_and_readings_are_those_of_the_devices(profile, tmp_path, n
         sent = np.round(np.random.default_rng(1).uniform(-5.0, 5.0, SAMPLES), 3)
         displacement_um, shown_um, measured = np.zeros((3, SAMPLES))
         for k in range(SAMPLES):
-            part = slice(k, k + 1)
+            part, before_ns = slice(k, k + 1), time.monotonic_ns()
             device.exchange(k, sent[part], displacement_um[part], measured[part])
             device.output()  # a command without a reply has been executed then
-            shown_um[k] = emulator.device._rig.displacement_um
-            clock.pass_s(0.001)
-        assert device.info.details["transactions"] == "2"
+            if blocks is None:
+                shown_um[k] = emulator.device._rig.displacement_um
+                clock.pass_s(0.001)
+            else:
+                shown_um[k] = blocks.last_read_um(device, before_ns)
+        assert device.info.details["transactions"] == ("1" if streams else "2")
+        assert device.lost_readings == 0
         device.close()
         device.make_safe(0.0)
     written = [each["current_a"] for each in logged(log)[before:] if "current_a" in each]

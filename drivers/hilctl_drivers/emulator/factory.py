@@ -17,15 +17,17 @@ from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLine
 from hilctl_drivers.emulator.rig import ACTUATORS, Bench, Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.sensor_stream import EmulatedStream
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
 from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire, SerialProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_base import BaseProfile, Range, SerialLineSettings
+from hilctl_drivers.sensor_stream.stream_profile import StreamProfile
 from hilctl_drivers.simulated.devices import PiezoOptions, PiezoStage, SimulatedDevice
 
-AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard
+AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard | EmulatedStream
 _DRIVE_V, _RANGE_UM = 100.0, 50.0  # of a piezo stage if no wiring is given
 
 
@@ -106,11 +108,16 @@ class _Plan:
             options, profile.outputs[self._output], reader.inputs[self._sensor]
         )
         source = reader.inputs[self._sensor]
-        markers = [getattr(source, key, "none") for key in ("validity", "invalid")]
-        if markers == ["none", "none"] and any(each.kind == "invalid" for each in options.faults):
+        markers = [getattr(source, key, None) for key in ("validity", "invalid", "valid")]
+        if set(markers) <= {"none", None} and any(
+            each.kind == "invalid" for each in options.faults
+        ):
             raise InputError(
-                f"fault invalid: {self._sensor} of {reader.title} has no validity or invalid"
+                f"fault invalid: {self._sensor} of {reader.title} has no validity, invalid or valid"
             )
+        stalls = any(each.kind == "stall" for each in options.faults)
+        if stalls and not isinstance(reader, StreamProfile):
+            raise InputError(f"fault stall: {reader.title} does not send unasked")
         self._links = (
             _Served.of(profile, options.link),
             _Served.of(reader, options.reader_link or options.link),
@@ -171,6 +178,8 @@ class _Plan:
             )
         if options.command is not None and output is not None:
             raise InputError(f"initial command is for Modbus profiles, not for {profile.title}")
+        if isinstance(profile, StreamProfile) and sensor is not None:
+            return EmulatedStream(profile, bench, sensor)
         if isinstance(profile, FrameProfile):
             return EmulatedBoard(profile, bench, output, sensor)
         assert isinstance(profile, AsciiProfile)
@@ -183,6 +192,10 @@ class _Plan:
         if isinstance(profile, ModbusProfile):
             units: Any = devices
             wire = ModbusWire(link.framing, units, options.lacking, options.mute)
+        elif isinstance(profile, StreamProfile):
+            (only,) = devices.values()
+            assert isinstance(only, EmulatedStream)
+            wire = only
         else:
             assert isinstance(profile, SerialProfile)
             members: Any = list(devices.values())[::-1]

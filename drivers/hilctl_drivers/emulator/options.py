@@ -15,10 +15,11 @@ LinkKind: TypeAlias = Literal["tcp", "rtu", "rtu_tcp"]
 
 FaultKind: TypeAlias = Literal[
     "silence", "delay", "late", "exception", "corrupt", "cut", "duplicate", "wrong_id", "reset",
-    "unplug", "invalid",
+    "unplug", "invalid", "stall",
 ]  # fmt: skip
 KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
 DELAY_S = 1.0
+_LASTING = ("delay", "late", "invalid", "stall")
 
 
 @dataclass(frozen=True, slots=True)
@@ -29,25 +30,25 @@ class WireFault:
     requests; ``exception`` refuses it; ``corrupt`` changes a byte of the reply; ``cut`` truncates
     it; ``duplicate`` sends it twice; ``wrong_id`` answers in another's name; ``reset`` breaks the
     connection; ``unplug`` is permanent silence on every connection; ``invalid`` marks readings as
-    invalid for a time.
+    invalid for a time; ``stall`` loses the samples of a stream for a time.
     """
 
     kind: FaultKind
     at_count: int | None = None  # transaction that has it, counted from 1
     at_s: float | None = None  # time since the start; the next transaction has it
-    delay_s: float = DELAY_S  # of delay, late and invalid
+    delay_s: float = DELAY_S  # of delay, late, invalid and stall
 
 
 def parse_fault(text: str) -> WireFault:
-    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; delay, late, invalid take ``:SECONDS`` before @."""
+    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; some kinds take ``:SECONDS`` before the @."""
     found = re.fullmatch(r"([a-z_]+)(?::(\d+(?:\.\d+)?))?@(\d+(?:\.\d+)?)(s?)", text)
     if found is None:
         raise InputError(f"fault must be KIND@COUNT or KIND@SECONDSs, got {text!r}")
     kind, delay, at, seconds = found.groups()
     if kind not in KINDS:
         raise InputError(f"fault must be one of {', '.join(KINDS)}, got {kind!r}")
-    if delay is not None and kind not in {"delay", "late", "invalid"}:
-        raise InputError(f"only delay, late and invalid take a time before the @, got {text!r}")
+    if delay is not None and kind not in _LASTING:
+        raise InputError(f"only {', '.join(_LASTING)} take a time before the @, got {text!r}")
     fault = WireFault(cast("FaultKind", kind), delay_s=float(delay or DELAY_S))
     if seconds:
         return replace(fault, at_s=float(at))

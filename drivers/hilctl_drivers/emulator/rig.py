@@ -103,7 +103,7 @@ class SimulatedWiring(SignalChain):
             gain, offset = _spread(output, info.command_min, info.command_max)
             keys = {f"gain_{unit}_per_{output.unit.lower()}": gain, f"offset_{unit}": offset}
             amplifier = Amplifier.model_validate(keys)
-        gain, offset = 1.0, 0.0  # of a reading in um
+        gain, offset = 1.0, 0.0 - sensor_input.rest  # of a reading in um
         if sensor_input.unit != "um":
             gain, offset = _spread(sensor_input, info.sensor_min_um, info.sensor_max_um)
         keys = {f"um_per_{sensor_input.unit.lower()}": gain, "offset_um": offset}

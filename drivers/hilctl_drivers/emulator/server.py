@@ -16,7 +16,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import NamedTuple
+from typing import NamedTuple, Protocol, runtime_checkable
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
@@ -56,6 +56,18 @@ class _Connection(ABC):
         """Close the connection, or break it."""
 
 
+@runtime_checkable
+class StreamWire(EmulatedWire, Protocol):
+    """A wire on which the device sends unasked."""
+
+    period_ns: int
+    stalled_until_ns: int
+
+    def block(self, now_ns: int) -> bytes:
+        """Return what is sent now; called once per period."""
+        ...
+
+
 class _TcpConnection(_Connection):
     """An accepted connection."""
 
@@ -75,6 +87,12 @@ class _TcpConnection(_Connection):
     def send(self, data: bytes) -> None:
         with suppress(OSError):
             self._connection.sendall(data)
+
+    def push(self, data: bytes) -> None:
+        """Send without waiting; data is lost while the host does not read."""
+        self.unsent += b"" if self.unsent else data
+        with suppress(OSError):
+            del self.unsent[: self._connection.send(self.unsent, socket.MSG_DONTWAIT)]
 
     def close(self, *, reset: bool = False) -> None:
         if reset:
@@ -160,6 +178,8 @@ class EmulatorServer:
         self._listeners[listener] = wire
         self._wires.append(wire)
         self._selector.register(listener, selectors.EVENT_READ)
+        if isinstance(wire, StreamWire):
+            self._push(wire, self._clock_ns())
         return f"{host}:{listener.getsockname()[1]}"
 
     def open_pty(self, wire: EmulatedWire, *, faulty: bool = True) -> str:
@@ -235,6 +255,14 @@ class EmulatorServer:
             if connection not in self._connections:
                 return
 
+    def _push(self, wire: StreamWire, now_ns: int) -> None:
+        """Send a stream's next block to its hosts, and schedule the one after it."""
+        data = wire.block(now_ns)
+        for connection in self._connections:
+            if connection.wire is wire and isinstance(connection, _TcpConnection):
+                connection.push(data)
+        self._schedule(now_ns + wire.period_ns, partial(self._push, wire))
+
     def _schedule(
         self, due_ns: int, action: Callable[[int], None], superseded_by: _Connection | None = None
     ) -> None:
@@ -252,6 +280,10 @@ class EmulatorServer:
         if fault is not None and fault.kind == "invalid":
             for wire in self._wires:
                 wire.mark_invalid(now_ns + round(fault.delay_s * 1e9))
+        if fault is not None and fault.kind == "stall":
+            for wire in self._wires:
+                if isinstance(wire, StreamWire):
+                    wire.stalled_until_ns = now_ns + round(fault.delay_s * 1e9)
         if fault is not None and fault.kind in {"silence", "unplug", "reset", "exception", "late"}:
             self._keep_back(fault, connection, request)
         else:

@@ -16,6 +16,12 @@ _FIRST = 256
 """Most replies are shorter; buffers up to 512 bytes come from Python's own pool, which is faster
 than the system's."""
 _CHUNK = 4096
+_RECEIVED, _MOST_CHUNKS = 65536, 64
+"""Bytes of one read of unasked data, and reads at a time."""
+_SO_TIMESTAMPNS = 35
+"""Option of Linux that Python does not name: the kernel's time of arrival with the data."""
+_TIMESPEC = struct.Struct("@ll")
+_NOTE_SIZE = socket.CMSG_SPACE(_TIMESPEC.size)
 
 
 def _connected(address: tuple[str, int], timeout_s: float) -> socket.socket:
@@ -128,6 +134,72 @@ class TcpLink:
         if self._socket is not None:
             _reset(self._socket)
             self._socket = None
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+class TcpReceiver:
+    """A TCP connection on which only the device sends.
+
+    ``timeout_s`` is the longest time to connect.
+    """
+
+    def __init__(self, host: str, port: int, timeout_s: float) -> None:
+        self._address = (host, port)
+        self._timeout_s = timeout_s
+        self._socket: socket.socket | None = None
+        self._looked_ns = 0
+
+    def open(self) -> None:
+        """Connect; raise LostError if no device answers."""
+        self.close()
+        self._looked_ns = time.monotonic_ns()
+        self._socket = made = _connected(self._address, self._timeout_s)
+        made.setblocking(False)
+        try:
+            made.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+        except OSError as error:  # reset since
+            raise LostError(f"connection lost: {why(error)}") from None
+
+    def wait(self, wait_s: float) -> bool:
+        """Wait until something arrives; return False if nothing has."""
+        assert self._socket is not None
+        return bool(select.select([self._socket], [], [], max(0.0, wait_s))[0])
+
+    def receive(self) -> tuple[bytes, int]:
+        """Return what has arrived, without waiting, and the age of its last byte in ns.
+
+        The kernel tells the time of arrival. If it does not, the age is the time since the last
+        call, which also limits the effect of a change of the system's clock.
+
+        Raises:
+            LostError: The link is not open, or broke.
+        """
+        if self._socket is None:
+            raise LostError("not open")
+        received, arrived_ns = b"", 0
+        looked_ns, self._looked_ns = self._looked_ns, time.monotonic_ns()
+        try:
+            for _ in range(_MOST_CHUNKS):
+                data, notes, *_rest = self._socket.recvmsg(_RECEIVED, _NOTE_SIZE)
+                if not data:
+                    raise LostError("connection closed by the device")
+                received += data
+                for _level, _kind, stamp in notes:
+                    seconds, ns = _TIMESPEC.unpack(stamp)
+                    arrived_ns = seconds * 10**9 + ns
+                if len(data) < _RECEIVED:
+                    break
+        except BlockingIOError:
+            pass
+        except OSError as error:
+            raise LostError(f"connection lost: {why(error)}") from None
+        age_ns = max(0, time.time_ns() - arrived_ns)
+        return received, min(age_ns, time.monotonic_ns() - looked_ns)
 
     def close(self) -> None:
         """Close the connection."""

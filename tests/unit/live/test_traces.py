@@ -2,14 +2,14 @@
 
 import numpy as np
 
-from hilctl.base.samples import BlockBatch
+from hilctl.base.samples import COLUMNS, BlockBatch
 from hilctl.live.traces import ROW, SIGNALS, traces_of
 
 
 def batch():
     made = BlockBatch.empty(2, 2, 1)
     made.heads[:, 1] = (10, 14)
-    made.columns[:] = np.arange(6.0)[None, :, None]
+    made.columns[:] = np.arange(float(len(COLUMNS)))[None, :, None]
     return made
 
 

@@ -7,7 +7,8 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl.base.samples import BlockHeader, Flag
+from hilctl.base.events import LOST_READINGS
+from hilctl.base.samples import COLUMNS, BlockHeader, Flag
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
@@ -554,3 +555,26 @@ def test_the_last_block_may_be_no_whole_one():
     rig = Rig(np.full(204, 2.0), block=10)
     assert rig.run().code == "completed"
     assert rig.device.commands[203:205] == [2.0, 2.0 - LIMITS.ramp_per_s / RATE_HZ]
+
+
+@dataclass
+class AgingFakeDevice(FakeDevice):
+    """A device with a sensor that sends unasked: each reading is as old as its sample's number."""
+
+    info: FakeInfo = field(default_factory=lambda: FakeInfo(ages_readings=True))
+    lost_readings: int = 3
+
+    @property
+    def reading_age_s(self):
+        return float(len(self.commands) - 1)
+
+
+@pytest.mark.parametrize("break_at", [10**9, 30])
+def test_the_age_of_each_reading_is_recorded_and_lost_ones_are_counted(break_at):
+    rig = Rig(sine(50), device=AgingFakeDevice(break_at=break_at))
+    rig.run()
+    age_s = rig.host.column([*COLUMNS].index("reading_age_s"))
+    ages = [*range(len(rig.device.commands))] + [np.nan] * (break_at == 30)
+    assert np.array_equal(age_s, ages, equal_nan=True)
+    lost = [dict(each.values) for each in rig.host.events if each.code == LOST_READINGS]
+    assert lost == [{"readings": 3}]

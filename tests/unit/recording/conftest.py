@@ -58,6 +58,7 @@ def write(
             start_unix_ns=START_NS,
             records_input=own_input,
             waveform_unit=waveform_unit,
+            ages_readings=measures,
         ),
     )
     writer = RecordingWriter(stream, facts)

@@ -3,12 +3,13 @@
 import socket
 import struct
 import threading
+import time
 
 import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.transport.links import LostError, NoAnswerError
-from hilctl_drivers.transport.tcp import TcpLink
+from hilctl_drivers.transport.tcp import TcpLink, TcpReceiver
 from tests.unit.drivers.transport.conftest import PATIENT_S, QUICK_S, REPLY, missing, tcp
 
 
@@ -150,3 +151,28 @@ def test_tcp_frame_error_closes_the_connection(serve):
         link.transact(b"ask", refuse)
     with pytest.raises(LostError):
         link.transact(b"ask", missing)
+
+
+def test_unasked_data_is_received_without_waiting(serve):
+    go = threading.Event()
+
+    def act(connection):
+        go.wait(PATIENT_S)
+        connection.sendall(REPLY)
+        connection.shutdown(socket.SHUT_WR)
+
+    receiver = TcpReceiver("127.0.0.1", serve(act), PATIENT_S)
+    with pytest.raises(LostError):
+        receiver.receive()
+    opened_ns = time.monotonic_ns()
+    receiver.open()
+    assert receiver.receive()[0] == b""
+    go.set()
+    assert receiver.wait(PATIENT_S)
+    data, age_ns = receiver.receive()
+    assert data == REPLY
+    assert 0 < age_ns <= time.monotonic_ns() - opened_ns
+    assert receiver.wait(PATIENT_S)
+    with pytest.raises(LostError, match="closed by the device"):
+        receiver.receive()
+    receiver.close()

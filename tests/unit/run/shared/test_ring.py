@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hilctl.base.samples import LAST_SAMPLE, LONGEST_NS, BlockHeader, Flag
+from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, BlockHeader, Flag
 from hilctl.run.shared import ring as module
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot
@@ -27,7 +27,7 @@ def born(ring, number, *, due=True):
     block.state[:] = -number
     for row in (block.reference, block.wanted, block.command, block.input_um):
         row[:] = number
-    block.displacement_um[:] = block.measured[:] = number
+    block.displacement_um[:] = block.measured[:] = block.reading_age_s[:] = number
     block.flags[:] = number
     ring.sending(block)
     return block
@@ -45,7 +45,7 @@ def test_blocks_come_out_as_they_went_in(tmp_path):
     assert push(ring, 2)
     batch = other.pop()
     assert batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [3, 6]
-    assert batch.columns[1].tolist() == [[2.0] * BLOCK] * 6
+    assert batch.columns[1].tolist() == [[2.0] * BLOCK] * len(COLUMNS)
     assert batch.states.tolist() == [[-1.0, -1.0], [-2.0, -2.0]]
     assert batch.flags.tolist() == [[1] * BLOCK, [2] * BLOCK]
     assert other.pop() is None

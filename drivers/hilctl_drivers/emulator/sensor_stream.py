@@ -1,0 +1,89 @@
+"""An emulated sensor that sends samples unasked: a profile's blocks in front of the rig."""
+
+from collections.abc import Iterator
+
+from hilctl_drivers.emulator.rig import Bench, EmulatedDevice
+from hilctl_drivers.emulator.wire import EmulatedReply
+from hilctl_drivers.sensor_stream.stream_profile import HeaderField, StreamProfile
+
+PERIOD_NS = 1_000_000
+"""Time from one block to the next."""
+
+
+class EmulatedStream(EmulatedDevice):
+    """A sensor on a TCP port of its own; its samples come at the profile's highest rate."""
+
+    profile: StreamProfile
+    period_ns = PERIOD_NS
+
+    def __init__(self, profile: StreamProfile, bench: Bench, sensor: str) -> None:
+        super().__init__(profile, bench, None)
+        self._source = profile.inputs[sensor]
+        self._inputs = profile.inputs.values()
+        self._begin_ns: int | None = None
+        self._sent = 0
+        self.stalled_until_ns = 0
+        """Time until which its samples are lost."""
+
+    def block(self, now_ns: int) -> bytes:
+        """Return the block with the samples since the last one; all show the present reading."""
+        self.tick(now_ns)
+        self._begin_ns = now_ns if self._begin_ns is None else self._begin_ns
+        due = 1 + int((now_ns - self._begin_ns) * self.profile.max_rate_hz * 1e-9) - self._sent
+        header = self.profile.header
+        frames = due if isinstance(header.frames, HeaderField) else min(due, 1)
+        if not frames or now_ns < self.stalled_until_ns:
+            self._sent += due
+            return b""
+        frame = self._frame()
+        head = bytearray(header.begin.encode().ljust(header.size, b"\0"))
+        numbers = (
+            (header.frames, frames),
+            (header.frame_size, len(frame)),
+            (header.counter, self._sent),
+        )
+        for field, number in numbers:
+            if isinstance(field, HeaderField):
+                modulus = 1 << 8 * field.format.size
+                head[field.at : field.at + field.format.size] = field.format.encode(
+                    number % modulus
+                )
+        self._sent += due
+        return bytes(head) + frame * frames
+
+    def _frame(self) -> bytes:
+        """Return a frame with the reading; the other values are 0."""
+        source, form, size = self._source, self._source.format, self.profile.header.frame_size
+        ends = [each.at + each.format.size for each in self._inputs]
+        frame = bytearray(max(ends) if isinstance(size, HeaderField) else size)
+        value = float(self.wiring.at_terminal(self._rig.displacement_um))
+        if self._is_invalid and source.valid is not None:
+            value = (source.valid[1] + 1) * source.scale + source.offset
+        frame[source.at : source.at + form.size] = form.encode(value)
+        return bytes(frame)
+
+    def requests(self, received: bytearray) -> Iterator[bytes]:
+        """Discard what the host sends."""
+        received.clear()
+        return iter(())
+
+    def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
+        """Return None: it answers nothing."""
+
+    def refusal(self, request: bytes) -> EmulatedReply | None:
+        """Return None: it answers nothing."""
+
+    def mark_invalid(self, until_ns: int) -> None:
+        """Mark its readings as invalid until a time."""
+        self.invalid_until_ns = until_ns
+
+    def encode(self, data: bytes) -> bytes:
+        """Return a block as it is sent."""
+        return data
+
+    def corrupt_at(self, framed: bytes) -> int:
+        """Return the byte of a block whose damage must be detected."""
+        return 0 * len(framed)
+
+    def _trip(self, due_ns: int) -> None:
+        raise AssertionError("it has no watchdog")

@@ -1,0 +1,157 @@
+"""Reader of the newest sample of a sensor that sends unasked."""
+
+import math
+import time
+from collections.abc import Callable
+from typing import cast
+
+from hilctl_drivers.dac_setup import DacSetup, SensorReader
+from hilctl_drivers.endpoint import Endpoint
+from hilctl_drivers.sensor_stream.stream_profile import (
+    HeaderField,
+    StreamInput,
+    StreamProfile,
+)
+from hilctl_drivers.transport.links import CorruptError, Link, NoAnswerError
+from hilctl_drivers.transport.tcp import TcpReceiver
+from hilctl_drivers.transport.wire_time import WireTime
+
+
+class BlockParser:
+    """Finds the newest value of an input in a stream of blocks.
+
+    Attributes:
+        value: The newest value in the input's unit; NaN if it is invalid or none has arrived.
+        values: Number of values since the beginning.
+        lost: Number of frames that did not arrive, according to the counter.
+    """
+
+    def __init__(self, profile: StreamProfile, source: StreamInput) -> None:
+        self._header = header = profile.header
+        self._begin = header.begin.encode()
+        self._frames = _number(header.frames)
+        self._frame_size = _number(header.frame_size)
+        counter = header.counter
+        self._counter = None if counter == "none" else _number(counter)
+        self._modulus = 0 if counter == "none" else 1 << 8 * counter.format.size
+        self._at, self._form, self._decode = source.at, source.format, source.format.decode
+        low, high = source.valid or (-math.inf, math.inf)
+        ends = [raw * source.scale + source.offset for raw in (low, high)]
+        self._low, self._high = min(ends), max(ends)
+        self._received = bytearray()
+        self._next: int | None = None
+        self.value = math.nan
+        self.values = self.lost = 0
+
+    def feed(self, data: bytes) -> bool:
+        """Take received bytes; return whether they complete a frame.
+
+        Raises:
+            CorruptError: A block does not begin as in the profile, or has no such input.
+        """
+        received, header, newest, start = self._received, self._header.size, 0, 0
+        received += data
+        if not self.values:
+            self._find_begin()
+        while len(received) - start >= header:
+            if not received.startswith(self._begin, start):
+                found = bytes(received[start : start + len(self._begin)])
+                raise CorruptError(f"a block must begin with {self._begin!r}, got {found!r}")
+            head = received[start : start + header]
+            frames, size = self._frames(head), self._frame_size(head)
+            end = start + header + frames * size
+            if end > len(received):
+                break
+            if frames:
+                self._check_size(size)
+                self._count(head, frames)
+                newest = end - size + self._at
+            start = end
+        if newest:
+            value = self._decode(received[newest : newest + self._form.size])
+            self.value = value if self._low <= value <= self._high else math.nan
+        del received[:start]
+        return newest > 0
+
+    def _find_begin(self) -> None:
+        """Discard bytes before the first block; the connection may begin within one."""
+        at = self._received.find(self._begin)
+        del self._received[: at if at >= 0 else max(0, len(self._received) - len(self._begin) + 1)]
+
+    def _check_size(self, size: int) -> None:
+        if self._at + self._form.size > size:
+            raise CorruptError(f"a frame has {size} bytes: the input at {self._at} is not in it")
+
+    def _count(self, head: bytearray, frames: int) -> None:
+        self.values += frames
+        if self._counter is None:
+            return
+        first = self._counter(head)
+        missing = 0 if self._next is None else (first - self._next) % self._modulus
+        if missing < self._modulus // 2:  # otherwise the sensor has restarted its counter
+            self.lost += missing
+        self._next = (first + frames) % self._modulus
+
+
+def _number(field: HeaderField | int) -> Callable[[bytearray], int]:
+    """Return a function of a header that returns a number in it."""
+    if not isinstance(field, HeaderField):
+        return lambda _: field
+    at, end, decode = field.at, field.at + field.format.size, field.format.decode
+    return lambda head: int(decode(head[at:end]))
+
+
+class StreamReader(SensorReader):
+    """A :class:`~hilctl_drivers.dac_setup.SensorReader` that takes the newest sample."""
+
+    AGES = True
+
+    def __init__(self, setup: DacSetup, link: Link) -> None:
+        """See :class:`~hilctl_drivers.dac_setup.SensorReader`."""
+        super().__init__(setup, link)
+        self._profile = cast(StreamProfile, setup.reader.profile)
+        self._source = cast(StreamInput, setup.input)
+        self._receiver: TcpReceiver = self._own
+        self._wait_s = setup.reader.timeout_s
+        self._parser = BlockParser(self._profile, self._source)
+        self._arrived_ns = 0
+
+    @staticmethod
+    def time(profile: StreamProfile, source: StreamInput) -> WireTime:
+        """See :meth:`~hilctl_drivers.dac_setup.SensorReader.time`."""
+        what = f"newest sample of {profile.title}, at most {1e3 * profile.link.max_age_s:g} ms old"
+        return WireTime(what, 0.0, 0.0, 0, 0.0, profile.turnaround_s, settle_s=source.settle_s)
+
+    @property
+    def lost(self) -> int:
+        """See :attr:`~hilctl_drivers.dac_setup.SensorReader.lost`."""
+        return self._parser.lost
+
+    def start(self) -> None:
+        """See :meth:`~hilctl_drivers.dac_setup.SensorReader.start`."""
+        self._take()
+        self._parser.lost = 0
+
+    def _new_link(self, reader: Endpoint) -> TcpReceiver:
+        return TcpReceiver(reader.host, int(reader.port), reader.timeout_s)
+
+    def _identify(self) -> None:
+        self._parser = BlockParser(self._profile, self._source)
+        deadline = time.monotonic() + self._wait_s
+        while not self._parser.values:
+            if not self._receiver.wait(deadline - time.monotonic()):
+                begin = self._profile.header.begin
+                raise NoAnswerError(f"no block that begins with {begin} within {self._wait_s:g} s")
+            self._take()
+
+    def _take(self) -> None:
+        data, age_ns = self._receiver.receive()
+        if data and self._parser.feed(data):
+            self._arrived_ns = time.monotonic_ns() - age_ns
+
+    def _read(self) -> float:
+        self._take()
+        if not self._parser.values:
+            return math.nan
+        self.age_s = 1e-9 * (time.monotonic_ns() - self._arrived_ns)
+        return self._parser.value if self.age_s <= self._profile.link.max_age_s else math.nan
