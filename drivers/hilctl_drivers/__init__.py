@@ -12,6 +12,7 @@ contract.py                 the device contract as tests, for any package
 transport/                  links, framing, wire time
 modbus/  labjack/           Modbus TCP and RTU, and LabJack streaming
 ascii/  board/              text protocols and binary frames, for ``serial_dac``
+sensor_stream/              sensors that send unasked
 simulated/  emulator/       simulated rigs, and the same rigs behind real wires
 
 A protocol folder holds profiles, messages, a session and a device. Its ``LINK_KINDS`` registers its

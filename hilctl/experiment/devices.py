@@ -39,6 +39,7 @@ _PROTOCOLS = {
     "ascii": "lines of text",
     "ascii_tcp": "lines of text over TCP",
     "frames": "binary frames",
+    "sensor_stream": "samples sent unasked",
 }
 """Names of protocols by ``link.kind`` of a profile."""
 

@@ -436,7 +436,9 @@ class Loop:
     def _record_lost_readings(self) -> None:
         if self._aging is not None and (lost := self._aging.lost_readings):
             text = f"{lost} readings of the sensor did not arrive"
-            event = Event(self._next_sample, "warning", LOST_READINGS, text, {"readings": lost})
+            event = Event(
+                max(0, self._ended_at - 1), "warning", LOST_READINGS, text, {"readings": lost}
+            )
             self._host.record_event(event)
 
     def _drain(self) -> None:

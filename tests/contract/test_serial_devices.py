@@ -26,6 +26,7 @@ SERIAL = (
     "kepco_bop agilent_34970a own", "tdk_lambda_gen agilent_34970a own",
     "kepco_bop labjack_t7 own", "icp_m7024_dcon adam_4117 own", "cobs_board labjack_t7 own",
     "kepco_bop cobs_board own", "magna_power_sl keyence_cl3000 own",
+    "kepco_bop capancdt_6200 own",
 )  # fmt: skip
 """What serial_dac is tried with: what drives, what reads, and whether they share a line."""
 PIEZO = ("pi_e709 V", "pi_e727 V", "cobs_board V", "icp_m7024_dcon agilent_34970a own V")
@@ -109,12 +110,14 @@ def wired(case, tmp_path, stack):
     if reader in shipped_profiles():
         text = shipped_profiles()[reader].read_text()
         reader = str(tmp_path / f"{reader}.yaml")
-        Path(reader).write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
+        text = text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0")
+        Path(reader).write_text(text.replace("max_age_s: 0.02", f"max_age_s: {TIMEOUT_S}"))
     if reader == "only_reads":
         reader = str(tmp_path / "only_reads.yaml")
         Path(reader).write_text(ONLY_READS)
     stream = getattr(profile, "exchange", "none") == "stream"
-    clock = time.monotonic_ns if stream else ManualClock()
+    unasked = case == UNASKED
+    clock = time.monotonic_ns if stream or unasked else ManualClock()
     wanted = EmulatorOptions(str(path), reader=reader, reader_line=line, actuator=actuator)
     emulator = stack.enter_context(emulated(wanted, clock))
     options = {**emulator.options, "timeout_s": TIMEOUT_S, "fifo_blocks": FIFO_BLOCKS}
@@ -126,7 +129,9 @@ def wired(case, tmp_path, stack):
     rig = emulator.device._rig
 
     def pass_time():
-        if not stream:
+        if unasked:
+            time.sleep(2.0 * SETTLED_S)
+        elif not stream:
             clock.pass_s(min(1.0 / rate_hz, SETTLED_S))
 
     block = BLOCK if device.info.latency_blocks else 1
@@ -147,12 +152,13 @@ def make(tmp_path):
 
 
 STREAMS = "cobs_board_fifo"
+UNASKED = "kepco_bop capancdt_6200 own"
 
 
 @pytest.fixture(
     params=[
-        # The FIFO drains in real time.
-        pytest.param(case, marks=pytest.mark.slow) if case == STREAMS else case
+        # A FIFO drains and a sensor sends in real time.
+        pytest.param(case, marks=pytest.mark.slow) if case in {STREAMS, UNASKED} else case
         for case in (*SERIAL, *PIEZO)
     ]
 )
@@ -177,6 +183,12 @@ def test_opening_does_not_move_the_output(driven, case):
     driven.device.close()
     with pytest.raises(DeviceError, match="no current"):
         driven.open()
+
+
+def test_two_of_a_kind_agree(driven, make, case):
+    """The times of samples that are sent unasked differ."""
+    if case != UNASKED:
+        contract.test_two_of_a_kind_agree(driven, make, case)
 
 
 def test_no_serial_profile_is_left_out():

@@ -20,6 +20,7 @@ from hilctl_drivers.profile import (
     shipped_profiles,
     with_link,
 )
+from hilctl_drivers.sensor_stream.stream_profile import StreamProfile
 
 MODBUS = """\
 vendor: Acme
@@ -88,7 +89,7 @@ WATCHDOG = {
     "arm": [{"kind": "write", "address": 9, "type": "uint16", "value": "timeout"}],
 }  # fmt: skip
 
-KINDS = "link.kind: must be one of ascii, ascii_tcp, frames, rtu, rtu_tcp, tcp"
+KINDS = "link.kind: must be one of ascii, ascii_tcp, frames, rtu, rtu_tcp, sensor_stream, tcp"
 
 BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"vendor": None}, "vendor: is required"),
@@ -305,7 +306,7 @@ class TestSchema:
     def test_covers_all_kinds(self):
         schema = json.loads(profile_schema_text())
         names = [choice["$ref"].rsplit("/", 1)[1] for choice in schema["oneOf"]]
-        kinds = (AsciiProfile, FrameProfile, ModbusProfile)
+        kinds = (AsciiProfile, FrameProfile, ModbusProfile, StreamProfile)
         assert names == [kind.__name__ for kind in kinds]
         objects = [part for part in schema["$defs"].values() if "properties" in part]
         assert len(objects) > 30

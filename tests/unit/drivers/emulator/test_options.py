@@ -32,7 +32,7 @@ def test_texts_are_read(kind):
 @pytest.mark.parametrize(("text", "words"), [
     ("silence", "KIND@COUNT"),
     ("noise@1", "must be one of silence"),
-    ("reset:2@1", "only delay, late and invalid"),
+    ("reset:2@1", "take a time before the @"),
     ("reset@0", "whole number from 1"),
     ("reset@1.5", "whole number from 1"),
     ("", "KIND@COUNT"),
