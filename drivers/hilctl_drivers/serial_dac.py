@@ -47,10 +47,8 @@ class SerialDac(DacDevice):
         profile = options.profile.profile
         driver = profile.driver
         if not driver:
-            rule = f"is one for kind: {profile.DEVICE}, not serial_dac"
-            if not profile.outputs:
-                rule = "has no output: name it as device.reader"
-            raise InputError(f"profile {options.profile.name} {rule}")
+            name, kind = options.profile.name, profile.DEVICE
+            raise InputError(f"profile {name} is one for kind: {kind}, not serial_dac")
         made: SerialDac = object.__new__(resolve_name(driver) if cls is SerialDac else cls)
         return made
 

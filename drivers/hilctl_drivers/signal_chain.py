@@ -293,7 +293,9 @@ class DacOptions(AddressOptions):
     )
 
     @model_validator(mode="after")
-    def _has_a_place(self) -> Self:
+    def _can_drive_from_a_place(self) -> Self:
+        if not self.profile.profile.outputs:
+            raise ValueError(f"profile {self.profile.name} has no output: name it as reader")
         if self.host is None is self.serial_port:
             raise ValueError("must have either host or serial_port")
         return self

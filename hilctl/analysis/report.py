@@ -13,7 +13,7 @@ from hilctl.analysis.run_metrics import RunReport, SegmentReport
 from hilctl.analysis.segment_metrics import SegmentReportBuilder
 from hilctl.analysis.steady_state import judged
 from hilctl.base.errors import DataError
-from hilctl.base.events import ADAPTED, CHANGES, MARK, Event
+from hilctl.base.events import ADAPTED, CHANGES, LOST_READINGS, MARK, Event
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
@@ -90,7 +90,7 @@ def _windows(recording: Recording, events: Sequence[Event], end: int) -> Windows
     return [(each, judged(each, events, end)) for each in recording.segments]
 
 
-_KEPT = {*CHANGES, ADAPTED, MARK}
+_KEPT = {*CHANGES, ADAPTED, LOST_READINGS, MARK}
 """Codes of events that a report uses or lists."""
 
 
@@ -107,6 +107,7 @@ class RunReportBuilder:
         self._counts: Counter[str] = Counter()
         self._waveform: tuple[int, int] | None = None
         self._command, self._displacement_um = _Extremes(), _Extremes()
+        self._age_s = _Extremes()
 
     @np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
     def add(self, piece: Recording) -> None:
@@ -134,6 +135,7 @@ class RunReportBuilder:
         self._counts["sensor_invalid_samples"] += int(np.count_nonzero(invalid))
         self._command.add(samples.command)
         self._displacement_um.add(samples.displacement_um)
+        self._age_s.add(samples.reading_age_s)
 
     def right_windows(self) -> Windows:
         """Return the windows by the progress and tuning of the run, after the last piece."""
@@ -147,12 +149,14 @@ class RunReportBuilder:
         """Return the report, after the last piece."""
         segments = tuple(segment.report() for segment in self._segments)
         adapted = [event.values for event in self._events if event.code == ADAPTED]
+        lost = [event.values["readings"] for event in self._events if event.code == LOST_READINGS]
         return RunReport(
             **_identity(self._last),
             **self._counted(),
             **_worst(segments),
             **self._timing(),
             adapted=dict(adapted[-1]) if adapted else {},
+            lost_readings=round(sum(lost)),
             marks=tuple(
                 (event.sample / self._last.sample_rate_hz, event.text)
                 for event in self._events
@@ -177,6 +181,7 @@ class RunReportBuilder:
             "command_max": self._command.high,
             "displacement_min_um": self._displacement_um.low,
             "displacement_max_um": self._displacement_um.high,
+            "reading_age_max_s": self._age_s.high,
         }
 
     def _timing(self) -> dict[str, Any]:

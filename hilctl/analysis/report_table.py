@@ -32,6 +32,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("displacement", _range(report.displacement_min_um, report.displacement_max_um, "um")),
         ("limited samples", f"{report.limited_samples:,}"),
         ("invalid readings", f"{report.sensor_invalid_samples:,}"),
+        *([("reading age", _age(report))] if report.reading_age_max_s is not None else []),
         ("ticks", f"{_count(report.late_ticks)} late, {_count(report.skipped_ticks)} skipped"),
         *([("timing", report.deadline_misses)] if report.deadline_misses else []),
         *([("adapted", adapted_text(report.adapted))] if report.adapted else []),
@@ -40,6 +41,11 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("exchange", _percentiles(report.exchange_us)),
         *((f"{name} process", usage_text(each)) for name, each in report.processes.items()),
     ]
+
+
+def _age(report: RunReport) -> str:
+    oldest = quantity(report.reading_age_max_s or 0.0, "s")
+    return f"at most {oldest}; {report.lost_readings:,} readings lost"
 
 
 def usage_text(usage: ProcessUsage) -> str:

@@ -92,6 +92,8 @@ class RunReport(RunMetrics):
         command_unit: ``A`` or ``V``, of ``command_min`` and ``command_max``.
         limited_samples: Samples of the waveform that the limiter changed.
         sensor_invalid_samples: Samples of the waveform with an invalid displacement.
+        reading_age_max_s: Largest age of a reading; None unless the sensor sends unasked.
+        lost_readings: Readings of such a sensor that did not arrive.
         late_ticks: Late ticks counted by the run; if not recorded, ticks later than half a tick
             period. None if neither is known.
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of the lateness of ticks;
@@ -129,6 +131,8 @@ class RunReport(RunMetrics):
     displacement_max_um: float | None
     limited_samples: int
     sensor_invalid_samples: int
+    reading_age_max_s: float | None
+    lost_readings: int
     late_ticks: int | None
     lateness_us: dict[str, float]
     lateness_by_minute: list[dict[str, float]]

@@ -13,7 +13,7 @@ from hilctl.analysis.report import processes_of, summarize, worst_segment
 from hilctl.analysis.report_table import run_rows
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import DataError
-from hilctl.base.events import ADAPTED, MARK, TUNED, Event
+from hilctl.base.events import ADAPTED, LOST_READINGS, MARK, TUNED, Event
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
@@ -129,6 +129,17 @@ class TestSteadyPeriodicRun:
         check_loop(report)
         assert report.sensor_invalid_samples == 2
         assert report.steady_samples == 3998
+
+    def test_age_and_number_of_lost_readings(self, lagging) -> None:
+        recording = lagging()
+        assert "reading age" not in dict(run_rows(summarize(recording)))
+        aged = np.linspace(0.001, 0.02, recording.samples.index.size)
+        aged[0] = np.nan
+        event = Event(4999, "warning", LOST_READINGS, "", {"readings": 7.0})
+        samples = replace(recording.samples, reading_age_s=aged)
+        report = summarize(replace(recording, samples=samples, events=(event,)))
+        assert (report.reading_age_max_s, report.lost_readings) == (0.02, 7)
+        assert "reading age" in dict(run_rows(report))
 
     def test_period_too_short_tells_no_noise(self, lagging) -> None:
         """With 12 samples a period, signal can't be told from noise."""

@@ -99,5 +99,5 @@ def test_it_is_a_reader_only(serial_bench, changes):
     if "profile" in changes:
         options["host"], options["tcp_port"] = "h", 1
         del options["serial_port"], options["reader"]
-    with pytest.raises(InputError):
+    with pytest.raises((InputError, ValueError)):
         SerialDac(SerialOptions.model_validate(options))
