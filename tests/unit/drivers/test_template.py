@@ -37,6 +37,7 @@ def test_a_device_can_be_made_of_it(name):
 
 @pytest.mark.parametrize(("name", "reader", "line"), [
     ("kepco_bop", "agilent_34970a", "own"),
+    ("kepco_bop", "capancdt_6200", "own"),
     ("adam_6224", "adam_6217", "own"),
     ("icp_m7024", "icp_m7017", "same"),
 ])  # fmt: skip
@@ -45,6 +46,12 @@ def test_the_sensor_may_be_on_another_device(name, reader, line):
     made(section)
     placed = {"host", "serial_port"} & section.values["reader"].keys()
     assert bool(placed) == (line == "own")
+
+
+def test_a_position_that_begins_at_zero_rests_in_the_middle():
+    section = starting_section("kepco_bop", "A", "capancdt_6200")
+    assert section.values["sensor"] == {"offset_um": -100.0}
+    assert starting_section("pi_e727", "V", None).values["sensor"] == {"offset_um": 0.0}
 
 
 def test_another_output_and_input_can_be_chosen():
