@@ -141,6 +141,10 @@ def parse_profile(text: str, where: str) -> BaseProfile:
         for index, key in enumerate(profile.unverified)
         if not document.holds(loc_of(key))
     ]
+    problems += [
+        ConfigProblem(document.where(loc_of(key)), key, rule, value)
+        for key, rule, value in profile.misfits()
+    ]
     if problems:
         raise ConfigError(problems)
     return profile

@@ -1,7 +1,7 @@
 """Parts of a device profile that all protocols share: link, ranges, watchdog, provenance."""
 
 import math
-from collections.abc import Mapping
+from collections.abc import Iterator, Mapping
 from dataclasses import replace
 from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
@@ -70,9 +70,10 @@ class SerialLineSettings(StreamSettings):
     boot_wait_s: float = Field(
         default=0.0, ge=0.0, le=30.0, description="wait after opening the port, s"
     )
-    flow: Literal["none", "xonxoff"] = Field(
+    flow: Literal["none", "xonxoff", "rts_cts"] = Field(
         default="none",
-        description="xonxoff: bytes 0x13 and 0x11 pause and resume the data, for lines of text",
+        description="xonxoff: bytes 0x13 and 0x11 pause and resume the data, for lines of text;"
+        " rts_cts: the lines RTS and CTS do",
     )
     dtr: bool | None = Field(
         default=None, description="level of DTR; if omitted, raised when the port is opened"
@@ -83,6 +84,12 @@ class SerialLineSettings(StreamSettings):
     rs485: Literal["high", "low"] | None = Field(
         default=None, description="level of RTS while sending, switched by the kernel (TIOCSRS485)"
     )
+
+    @model_validator(mode="after")
+    def _rts_is_free(self) -> Self:
+        if self.flow == "rts_cts" and (self.rts is not None or self.rs485 is not None):
+            raise ValueError("rts and rs485 must be omitted if flow is rts_cts")
+        return self
 
     @property
     def char_s(self) -> float:
@@ -110,8 +117,8 @@ class BinaryLineSettings(SerialLineSettings):
 
     @model_validator(mode="after")
     def _all_bytes_pass(self) -> Self:
-        if self.flow != "none":
-            raise ValueError(f"flow must be none if bytes 0x11 and 0x13 are data, got {self.flow}")
+        if self.flow == "xonxoff":
+            raise ValueError("flow must not be xonxoff if bytes 0x11 and 0x13 are data")
         return self
 
 
@@ -260,6 +267,10 @@ class BaseProfile(StrictModel):
         if any(each.per_unit("um") for each in self.outputs.values()):
             raise ValueError("units um, mm and nm are for inputs")
         return self
+
+    def misfits(self) -> Iterator[tuple[str, str, str]]:
+        """Yield the dotted key, the rule and the value of each text that does not fit the link."""
+        return iter(())
 
     @property
     def driver(self) -> str:

@@ -1,8 +1,8 @@
 """A DAC and an ADC on a serial line or a TCP stream as one device: ``serial_dac``.
 
-The profile names the protocol: lines of text (SCPI, GCS, DCON, GEN), binary frames sample by
-sample, or binary frames through a board's FIFO. On lines and single frames a tick is one request
-and its reply, or two if writing and reading are separate. No request is sent before the last reply
+The profile names the protocol: lines of text (SCPI, GCS, DCON, GEN), frames of fixed bytes, a
+board's frames sample by sample, or through its FIFO. Except for a FIFO, a tick is one request and
+its reply, or two if writing and reading are separate. No request is sent before the last reply
 has come, and the line is drained after a timeout.
 """
 

@@ -38,6 +38,7 @@ _PROTOCOLS = {
     "rtu_tcp": "Modbus RTU over TCP",
     "ascii": "lines of text",
     "ascii_tcp": "lines of text over TCP",
+    "bytes": "frames of fixed bytes",
     "frames": "binary frames",
     "sensor_stream": "samples sent unasked",
 }

@@ -5,7 +5,7 @@ from itertools import chain
 import pytest
 
 from hilctl.base.yaml import load_document, loc_of
-from hilctl_drivers.ascii.ascii_profile import AsciiProfile, SendStep, fields_of
+from hilctl_drivers.ascii.ascii_profile import AsciiProfile, SendStep, fields_of, fill
 from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.modbus.pdu import read_pdu, rtu_adu, write_single_pdu
@@ -18,8 +18,9 @@ NAMES = (
     "cobs_board_fifo",
     "generic_float32", "icp_et7000", "icp_m7017", "icp_m7024", "icp_m7024_dcon", "kepco_bop",
     "keyence_cl3000", "labjack_t4", "labjack_t7", "labjack_t8", "magna_power_sl",
-    "moxa_iologik_e1240", "pi_e709", "pi_e727", "tdk_lambda_gen", "wago_750", "waveshare_ai_8ch",
-    "waveshare_ai_8ch_b", "waveshare_ao_8ch", "waveshare_ao_8ch_b",
+    "moxa_iologik_e1240", "npoint_lc400", "pi_e709", "pi_e727", "tdk_lambda_gen", "thorlabs_kpz101",
+    "thorlabs_ksg101", "wago_750", "waveshare_ai_8ch", "waveshare_ai_8ch_b", "waveshare_ao_8ch",
+    "waveshare_ao_8ch_b",
 )  # fmt: skip
 
 OUTPUTS = [
@@ -268,12 +269,16 @@ def test_flash_is_not_rewritten(modbus, name):
     ("tdk_lambda_gen", "current", 7.07, "PC 7.070"),
     ("pi_e727", "axis1", 12.5, "SVA 1 12.5000"),
     ("magna_power_sl", "current", 2.5, "CURR 2.5000"),
+    ("thorlabs_kpz101", "voltage", 75.0, "43 06 04 00 D0 01 01 00 FF 7F"),
+    ("thorlabs_kpz101", "voltage", 0.0, "43 06 04 00 D0 01 01 00 00 00"),
+    ("npoint_lc400", "axis1", 0.0190735, "A2 18 12 83 11 E8 03 00 00 55"),
+    ("npoint_lc400", "axis1", -10.0, "A2 18 12 83 11 01 00 F8 FF 55"),
 ])  # fmt: skip
 def test_text_output(profiles, name, output, value, line):
     """The output line agrees with the manual and has no exponent."""
     profile = profiles[name]
-    address = 0 if profile.address == "none" else profile.address
-    assert profile.outputs[output].write.format(value=value, address=address) == line
+    channel = profile.outputs[output]
+    assert fill(channel.write, value=channel.number(value), address=profile.unit) == line
 
 
 def test_dcon_watchdog(profiles):

@@ -43,6 +43,27 @@ turnaround_s: 0.0
 max_rate_hz: 1000.0
 watchdog: none
 """
+FRAMES = """\
+vendor: nobody
+model: a piezo controller with frames of fixed bytes
+source: [this test]
+verified: "yes"
+link: {kind: bytes, baud: 115200, flow: rts_cts, checksum: sum8}
+address: none
+outputs:
+  axis1:
+    {write: "A2 {value:int32} 55", reply: none, scale: 1.0e-6, unit: V, min: -10.0, max: 10.0,
+      readback: {ask: "A0 01", pattern: "A0 01 {value:int32}", example: "A0 01 00 00 00 05"}}
+inputs:
+  position1:
+    {ask: "A0 02", pattern: "A0 02 {value:float32 DCBA}", example: "A0 02 00 00 80 3F", unit: um,
+      min: -125, max: 125}
+exchange: none
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+watchdog: none
+"""
+OWN = {"gcs": GCS, "frames": FRAMES}
 PAIRS = {
     "text with LabJack": ("kepco_bop", {"reader": "labjack_t7"}),
     "Modbus TCP with text": ("adam_6224", {"reader": "agilent_34970a"}),
@@ -52,6 +73,8 @@ PAIRS = {
         "kepco_bop", {"reader": "icp_m7017", "link": "tcp", "reader_link": "rtu_tcp"},
     ),
     "board with text over TCP": ("cobs_board", {"reader": "gcs"}),
+    "frames of fixed bytes": ("frames", {}),
+    "text with frames": ("kepco_bop", {"reader": "frames"}),
     "Modbus RTU with a board": ("icp_m7024", {"reader": "cobs_board"}),
     "text with a stream": ("kepco_bop", {"reader": "capancdt_6200"}),
 }  # fmt: skip
@@ -62,7 +85,7 @@ def profile(tmp_path):
     """Return a function that returns the path of a profile, of which no board has to boot."""
 
     def of(name):
-        text = GCS if name == "gcs" else shipped_profiles()[name].read_text()
+        text = OWN.get(name) or shipped_profiles()[name].read_text()
         path = tmp_path / f"{name}.yaml"
         text = text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0")
         path.write_text(text.replace("max_age_s: 0.02", f"max_age_s: {PATIENT_S}"))
@@ -119,6 +142,7 @@ def test_all_commands_and_readings_are_those_of_the_devices(profile, tmp_path, n
         device = chosen(chosen.Options.model_validate(keys))
         device.open(min(10.0, device.info.max_rate_hz), 1)
         device.arm()
+        device.output()  # whatever opening sent has been executed then
         before = len(logged(log))
         sent = np.round(np.random.default_rng(1).uniform(-5.0, 5.0, SAMPLES), 3)
         displacement_um, shown_um, measured = np.zeros((3, SAMPLES))

@@ -1,4 +1,6 @@
-"""Devices with a text protocol (SCPI, GCS, DCON): profile, lines, session, and ``serial_dac``."""
+"""Devices with text (SCPI, GCS, DCON) or fixed frames: profile, session, and ``serial_dac``."""
 
-LINK_KINDS = dict.fromkeys(("ascii", "ascii_tcp"), f"{__name__}.ascii_profile:AsciiProfile")
+LINK_KINDS = dict.fromkeys(
+    ("ascii", "ascii_tcp", "bytes"), f"{__name__}.ascii_profile:AsciiProfile"
+)
 """Class of profiles per ``link.kind``."""

@@ -1,4 +1,4 @@
-"""``serial_dac`` for devices with a text protocol."""
+"""``serial_dac`` for devices with a text protocol or fixed frames."""
 
 import re
 from functools import partial
@@ -6,12 +6,19 @@ from string import Formatter
 
 from hilctl.base.errors import UnconfirmedError
 from hilctl.base.types import F64
-from hilctl_drivers.ascii.ascii_profile import AsciiInput, AsciiOutput, AsciiProfile
+from hilctl_drivers.ascii.ascii_profile import (
+    AsciiInput,
+    AsciiOutput,
+    AsciiProfile,
+    binary_format,
+    fill,
+)
 from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
     arm_s,
     exchange_time,
     feed_time,
+    parse_number,
     query_time,
     reading,
 )
@@ -27,7 +34,7 @@ _NO_EVIDENCE = (
 
 
 class AsciiDac(SerialDac):
-    """A :class:`~hilctl_drivers.serial_dac.SerialDac` with lines of text."""
+    """A :class:`~hilctl_drivers.serial_dac.SerialDac` with lines of text or fixed frames."""
 
     def _prepare(self) -> None:
         setup, options = self._setup, self._options
@@ -90,10 +97,10 @@ class AsciiDac(SerialDac):
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
         del first_sample
-        value = self._chain.output(command.item()) + 0.0  # makes 0.0 of -0.0
+        value = self._chain.output(command.item())
         combined = self._profile.exchange
         if combined != "none" and self._is_combined:
-            text = self._writer.text(combined.write, value=value)
+            text = self._writer.text(combined.write, value=self._target.number(value))
             number = reading(combined, partial(self._writer.ask, text))
             found = self._profile.inputs[combined.input].value(number)
         else:
@@ -117,7 +124,7 @@ class AsciiDac(SerialDac):
         # An undetectable trip may have changed the output since the last command.
         if readback.of == "command" and watchdog != "none" and watchdog.tripped == "none":
             return None
-        return self._writer.number(readback)
+        return self._target.value(self._writer.number(readback))
 
     def _look(self) -> tuple[float, float | None]:
         self._connect()
@@ -158,7 +165,7 @@ class AsciiDac(SerialDac):
         return self._writer.ask(text, reply).string != text
 
     def _command(self, value: float) -> str:
-        return self._writer.text(self._target.write, value=value)
+        return self._writer.text(self._target.write, value=self._target.number(value))
 
     def _measured_output(self) -> float | None:
         """Return the output as the device measures it, or as it says that it is, tripped or not."""
@@ -183,7 +190,7 @@ class AsciiDac(SerialDac):
         # A command without a reply may have been ignored.
         readback = self._target.readback
         if readback != "none":
-            self._check_read_back(value, self._writer.number(readback))
+            self._check_read_back(value, self._target.value(self._writer.number(readback)))
         elif self._profile.error_query != "none":
             self._writer.check_errors()
         elif not answered:
@@ -199,14 +206,16 @@ class AsciiDac(SerialDac):
             return
         fields = Formatter().parse(self._target.write)
         spec = next(spec for _, field, spec, _ in fields if field == "value")
-        if float(format(value + 0.0, spec or "")) != value:
+        spec = spec or ""
+        sent = fill(f"{{value:{spec}}}", value=self._target.number(value))
+        if self._target.value(parse_number(sent, binary_format(spec))) != value:
             return
 
         def put() -> None:
-            self._write(value + 0.0)
+            self._write(value)
             self._writer.check_errors()
 
-        try_out(self._target, value, put, f"with {self._command(value + 0.0)}")
+        try_out(self._target, value, put, f"with {self._command(value)}")
 
     def _unconfirmed(self) -> str:
         """Return why a value cannot be confirmed; empty if it can."""
@@ -214,7 +223,7 @@ class AsciiDac(SerialDac):
         if self._target.readback != "none" or self._profile.error_query != "none":
             return ""
         if reply == "none" or _without_numbers(reply.example) == _without_numbers(
-            self._command(0.0)
+            self._command(self._target.min)
         ):
             return _NO_EVIDENCE
         return ""
@@ -240,7 +249,7 @@ class AsciiDac(SerialDac):
         if name == "safe":
             steps = steps.get(options.output, ())
         counts = watchdog.counts(options.watchdog_timeout_s or watchdog.min_s)
-        safe = self._chain.output(options.safe_command)
+        safe = self._target.number(self._chain.output(options.safe_command))
         self._writer.run(steps, timeout=counts, safe=safe)
 
     def _feed(self) -> None:

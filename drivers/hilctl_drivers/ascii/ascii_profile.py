@@ -1,4 +1,4 @@
-r"""Profiles of devices with a text protocol: templates of requests and patterns of replies.
+r"""Profiles of devices with a text protocol or fixed frames: request templates, reply patterns.
 
 A template is a Python format string with the fields ``{value}``, ``{address}``, ``{timeout}`` and
 ``{safe}``, such as ``#{address:02X}0{value:+07.3f}``. A pattern is a regular expression that must
@@ -7,18 +7,26 @@ pattern is for, proves that it matches, and tells how long a reply is.
 
 A line feed in a template separates lines that are sent in one write, such as
 ``SVA 1 {value:.4f}\nPOS? 1``. A line feed in an example separates the lines of one reply.
+
+A frame is written as its bytes in hexadecimal, such as ``A0 34 13 83 11 55``. The field
+``{value:int32 DCBA}`` stands for the bytes of a number, in templates and in patterns; type and
+order are those of :mod:`hilctl_drivers.modbus.register_map`. The example shows a reply's length.
 """
 
 import re
+from collections.abc import Iterator
 from dataclasses import replace
+from functools import cache
 from string import Formatter
-from typing import Annotated, ClassVar, Literal, Self, TypeAlias
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias, get_args
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from hilctl.base.strict import StrictModel
+from hilctl_drivers.modbus.register_map import RegisterFormat, RegisterType
 from hilctl_drivers.profile_base import (
     BaseProfile,
+    BinaryLineSettings,
     Name,
     Range,
     SerialLineSettings,
@@ -26,17 +34,70 @@ from hilctl_drivers.profile_base import (
     WaitStep,
     Watchdog,
 )
+from hilctl_drivers.transport.crc import CrcName
 from hilctl_drivers.transport.serial_port import SerialSettings
 
-_SAMPLES = {"value": 0.0, "safe": 0.0, "address": 1, "timeout": 1}
+SAMPLES = {"value": 0.0, "safe": 0.0, "address": 1, "timeout": 1}
+"""The fields of templates, with a value for each."""
+_BINARY = re.compile(rf"({'|'.join(get_args(RegisterType))})(?: ([A-H]+))?")
+_BINARY_FIELD = re.compile(r"\{value:([^{}]*)\}")
+
+
+@cache
+def binary_format(spec: str) -> RegisterFormat | None:
+    """Return the type of a field that stands for bytes; None for one of text.
+
+    Raises:
+        ValueError: The byte order does not fit the type.
+    """
+    found = _BINARY.fullmatch(spec)
+    return RegisterFormat(found[1], found[2] or "") if found else None  # type: ignore[arg-type]
+
+
+class _Number(float):
+    """A number whose format may be a type of :func:`binary_format`: its bytes in hexadecimal."""
+
+    def __format__(self, spec: str) -> str:
+        binary = binary_format(spec)
+        return super().__format__(spec) if binary is None else as_text(binary.encode(self))
+
+
+def as_text(data: bytes) -> str:
+    """Return bytes as they are written in profiles."""
+    return data.hex(" ").upper()
+
+
+def fill(template: str, **values: float) -> str:
+    """Return a template with its fields filled in; numbers of type float may become bytes.
+
+    Raises:
+        BadRequestError: The type of a field cannot hold the value.
+    """
+    return template.format(
+        **{name: _Number(v) if isinstance(v, float) else v for name, v in values.items()}
+    )
+
+
+@cache
+def pattern_of(text: str) -> tuple[re.Pattern[str], RegisterFormat | None]:
+    """Return a pattern as a regular expression, and the type of its number if that is bytes."""
+    field = _BINARY_FIELD.search(text)
+    if field is None:
+        return re.compile(text, re.ASCII), None
+    binary = binary_format(field[1])
+    if binary is None:
+        known = ", ".join(get_args(RegisterType))
+        raise ValueError(f"{field[0]} must have a type of {known}, and may have an order")
+    group = rf"([0-9A-F]{{2}}(?: [0-9A-F]{{2}}){{{binary.size - 1}}})"
+    return re.compile(text.replace(field[0], group, 1), re.ASCII), binary
 
 
 def _check_template(text: str) -> str:
     for _, field, form, conversion in Formatter().parse(text):
-        if field is not None and (field not in _SAMPLES or conversion or "{" in (form or "")):
-            known = ", ".join(f"{{{name}}}" for name in _SAMPLES)
+        if field is not None and (field not in SAMPLES or conversion or "{" in (form or "")):
+            known = ", ".join(f"{{{name}}}" for name in SAMPLES)
             raise ValueError(f"fields must be of {known}")
-    lines = text.format(**_SAMPLES).split("\n")
+    lines = fill(text, **SAMPLES).split("\n")
     if not all(line and line.isprintable() for line in lines) or not text.isascii():
         raise ValueError(r"must be printable ASCII, with \n between lines")
     return text
@@ -44,7 +105,7 @@ def _check_template(text: str) -> str:
 
 def _check_pattern(text: str) -> str:
     try:
-        re.compile(text, re.ASCII)
+        pattern_of(text)
     except re.error as error:
         raise ValueError(f"must be a regular expression: {error}") from None
     return text
@@ -102,10 +163,26 @@ class AsciiTcpLink(TextLines):
     port: int = Field(ge=1, le=65535, description="TCP port; SCPI uses 5025")
 
 
+class BytesLink(BinaryLineSettings):
+    """Frames of fixed bytes on a serial line; a reply is as long as its example."""
+
+    COMMON: ClassVar[tuple[str, ...]] = ("checksum", "echo")
+
+    kind: Literal["bytes"]
+    checksum: CrcName | Literal["sum8"] = Field(
+        default="none",
+        description="check behind each frame, least significant byte first; sum8: low byte of the"
+        " sum",
+    )
+
+
 class Reply(StrictModel):
     """Form of a good reply."""
 
-    pattern: Pattern = Field(description="regular expression for a whole reply, no terminator")
+    pattern: Pattern = Field(
+        description="regular expression for a whole reply, no terminator; in frames, {value:int16}"
+        " stands for the bytes of the number"
+    )
     example: str = Field(description="a reply as in the manual; pattern must match it")
 
     @model_validator(mode="after")
@@ -121,7 +198,7 @@ class Reply(StrictModel):
 
     def match(self, text: str) -> re.Match[str] | None:
         """Return the match of a whole reply."""
-        return re.fullmatch(self.pattern, text, re.ASCII)
+        return pattern_of(self.pattern)[0].fullmatch(text)
 
 
 class NumberReply(Reply):
@@ -132,11 +209,18 @@ class NumberReply(Reply):
         match = self.match(self.example)
         if match is None or match.re.groups != 1:
             raise ValueError(f"pattern {self.pattern!r} must have one group, around the number")
+        if self.binary is not None:
+            return self
         try:
             float(match[1])
         except ValueError:
             raise ValueError(f"the group must hold a number, got {match[1]!r}") from None
         return self
+
+    @property
+    def binary(self) -> RegisterFormat | None:
+        """Type of a number in bytes; None for one in text."""
+        return pattern_of(self.pattern)[1]
 
 
 class MeasuredReply(NumberReply):
@@ -164,10 +248,30 @@ class Readback(Query):
     )
 
 
-class AsciiOutput(Range):
-    """An output set by a line of text."""
+class ScaledRange(Range):
+    """A channel whose value = number * scale + offset.
 
-    write: LineTemplate = Field(description="sets it, with {value} in unit")
+    Attributes:
+        scale: Factor of the number.
+        offset: Added to the scaled number.
+    """
+
+    scale: float = 1.0
+    offset: float = 0.0
+
+    def value(self, number: float) -> float:
+        """Return the value of a number on the wire, in ``unit``."""
+        return number * self.scale + self.offset
+
+    def number(self, value: float) -> float:
+        """Return the number on the wire of a value in ``unit``; never -0.0."""
+        return (value - self.offset) / self.scale + 0.0
+
+
+class AsciiOutput(ScaledRange):
+    """An output set by a line of text or a frame; value = number * scale + offset."""
+
+    write: LineTemplate = Field(description="sets it, with {value}, the number")
     reply: Reply | Literal["none"] = Field(
         description="form of a good reply; none if there is none"
     )
@@ -179,26 +283,17 @@ class AsciiOutput(Range):
     def _has_value(self) -> Self:
         if "value" not in fields_of(self.write):
             raise ValueError("write must have the field {value}")
+        for limit in self.limits:
+            fill(self.write, **SAMPLES | {"value": self.number(limit)})
         return self
 
 
-class AsciiInput(Range, Query, MeasuredReply):
-    """An input that is read with a line of text; value = number * scale + offset.
+class AsciiInput(ScaledRange, Query, MeasuredReply):
+    """An input that is read with a line of text or a frame; value = number * scale + offset."""
 
-    Attributes:
-        scale: Factor of the number.
-        offset: Added to the scaled number.
-    """
-
-    scale: float = 1.0
-    offset: float = 0.0
     measures: Literal["terminal", "output"] = Field(
         default="terminal", description="terminal: what is wired to it; output: its own output"
     )
-
-    def value(self, number: float) -> float:
-        """Return the value of a number in a reply, in ``unit``."""
-        return number * self.scale + self.offset
 
 
 class AsciiExchange(MeasuredReply):
@@ -207,7 +302,7 @@ class AsciiExchange(MeasuredReply):
     Attributes:
         output: Name of the output.
         input: Name of the input.
-        write: Line or lines that are sent, with {value} in the unit of the output.
+        write: Line or lines that are sent, with {value}, the number of the output.
     """
 
     output: Name
@@ -284,7 +379,7 @@ class Check(Reply):
 
 
 class AsciiWatchdog(Watchdog):
-    """A host watchdog set by lines of text; {timeout} is in counts, {safe} in the output's unit.
+    """A host watchdog set by lines of text; {timeout} is in counts, {safe} a number as in write.
 
     Attributes:
         arm: Steps that arm it.
@@ -314,7 +409,7 @@ class AsciiWatchdog(Watchdog):
 
 
 class AsciiProfile(BaseProfile):
-    """A device with a text protocol.
+    """A device with a text protocol or fixed frames.
 
     Attributes:
         link: Serial line or TCP connection.
@@ -329,7 +424,7 @@ class AsciiProfile(BaseProfile):
     DEVICE: ClassVar[str] = "serial_dac"
     READER: ClassVar[str] = "hilctl_drivers.ascii.ascii_session:TextReader"
 
-    link: Annotated[AsciiLink | AsciiTcpLink, Field(discriminator="kind")]
+    link: Annotated[AsciiLink | AsciiTcpLink | BytesLink, Field(discriminator="kind")]
     address: int | Literal["none"] = Field(description="device address as shipped, for {address}")
     outputs: dict[Name, AsciiOutput]
     inputs: dict[Name, AsciiInput]
@@ -353,7 +448,7 @@ class AsciiProfile(BaseProfile):
             raise ValueError("exchange.output and exchange.input must be an output and an input")
         if "value" not in fields_of(self.exchange.write):
             raise ValueError("exchange.write must have the field {value}")
-        if "\n" in self.exchange.write and self.link.min_gap_s:
+        if "\n" in self.exchange.write and self.link.silence_s:
             raise ValueError(
                 "exchange.write must be one line if min_gap_s separates commands, got "
                 f"{self.exchange.write!r}"
@@ -374,6 +469,18 @@ class AsciiProfile(BaseProfile):
                     raise ValueError(f"errors: {error.pattern!r} matches the {name}")
         return self
 
+    def misfits(self) -> Iterator[tuple[str, str, str]]:
+        """See :meth:`~hilctl_drivers.profile_base.BaseProfile.misfits`."""
+        rule = "must be bytes in upper-case hexadecimal with a blank between, like 0A 1F"
+        if isinstance(self.link, BytesLink):
+            for key, text in _texts(self.model_dump(), {"write", "ask", "text", "example"}):
+                if not _is_bytes(text):
+                    yield key, rule, repr(text)
+
+    def requests(self) -> Iterator[tuple[str, str]]:
+        """Yield the dotted key and the template of each request."""
+        return _texts(self.model_dump(), {"write", "ask", "text"})
+
     @property
     def unit(self) -> int:
         """The address as shipped; 0 if it has none."""
@@ -388,3 +495,22 @@ class AsciiProfile(BaseProfile):
     def driver(self) -> str:
         """See :attr:`~hilctl_drivers.profile_base.BaseProfile.driver`."""
         return "hilctl_drivers.ascii.ascii_dac:AsciiDac"
+
+
+def _texts(data: Any, names: set[str], key: str = "") -> Iterator[tuple[str, str]]:
+    """Yield the dotted key and the value of each text with one of these names."""
+    items = data.items() if isinstance(data, dict) else enumerate(data)
+    for name, each in items:
+        if isinstance(each, dict | tuple):
+            yield from _texts(each, names, f"{key}{name}.")
+        elif name in names:
+            yield f"{key}{name}", each
+
+
+def _is_bytes(template: str) -> bool:
+    """Return whether all lines of a template or an example are bytes as :func:`as_text` has."""
+    try:
+        lines = fill(template, **SAMPLES).split("\n")
+        return all(as_text(bytes.fromhex(line)) == line for line in lines)
+    except ValueError:
+        return False

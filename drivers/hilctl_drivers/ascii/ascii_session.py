@@ -1,4 +1,4 @@
-"""Session with a text device: lines, checksums, numbers, and transmission times.
+"""Session with a device of text or frames: messages, checksums, numbers, transmission times.
 
 DCON (ICP DAS, Advantech ADAM): ICP DAS "DCON protocol command set". GEN (TDK-Lambda): "Genesys User
 Manual" 7.5. SCPI: SCPI-1999 volume 1, 7.2.1 for numbers; number forms as in IEEE 488.2, 8.7.
@@ -7,28 +7,34 @@ Manual" 7.5. SCPI: SCPI-1999 volume 1, 7.2.1 for numbers; number forms as in IEE
 import math
 import re
 import time
-from collections.abc import Callable, Iterable, Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.ascii.ascii_profile import (
     AsciiInput,
+    AsciiLink,
     AsciiProfile,
     AsciiStep,
+    AsciiTcpLink,
     AsciiWatchdog,
     AskStep,
+    BytesLink,
     Check,
     MeasuredReply,
     NumberStep,
     Query,
     Reply,
     SendStep,
+    as_text,
+    fill,
 )
 from hilctl_drivers.dac_setup import DacSetup, SensorReader
+from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.profile_base import WaitStep
-from hilctl_drivers.transport.crc import Bytes, dcon_checksum, gen_checksum
+from hilctl_drivers.transport.crc import CRCS, Bytes, Crc, dcon_checksum, gen_checksum
 from hilctl_drivers.transport.framing import DelimitedSplitter
 from hilctl_drivers.transport.links import (
     BadRequestError,
@@ -36,6 +42,7 @@ from hilctl_drivers.transport.links import (
     IncompleteError,
     Link,
     MismatchError,
+    Missing,
     NoAnswerError,
     RefusedError,
     WatchdogTrippedError,
@@ -59,6 +66,7 @@ def _is_text(text: str) -> bool:
 class LineFormat:
     """Format of one line: ``text | checksum | terminator``."""
 
+    NAME: ClassVar[str] = "line"
     terminator: bytes = b"\r"
     checksum: Literal["none", "dcon", "gen"] = "none"  # two hex digits, for gen after a $
     size_max: int = 255  # bytes without the terminator
@@ -94,6 +102,27 @@ class LineFormat:
         """Return a splitter at the beginning of a stream of lines."""
         return DelimitedSplitter(self._text, self.terminator, self.size_max, skip_empty=False)
 
+    def size(self, text: str) -> int:
+        """Return the bytes of a text of one or more lines on the wire."""
+        extra = _CHECKSUM_CHARS[self.checksum] + len(self.terminator)
+        return len(text) + _lines(text) * extra - text.count("\n")
+
+    def missing(self, example: str) -> Missing:
+        """Return how much is missing of a message with as many lines as ``example``."""
+        lines = _lines(example)
+
+        def missing(got: bytearray) -> int:
+            if len(got) > (lines + 1) * self.size_max:
+                raise CorruptError(f"no end of line within {len(got)} bytes")
+            return max(0, lines - got.count(self.terminator))
+
+        return missing
+
+    def split(self, data: Bytes, example: str) -> list[str]:
+        """Return the texts of a reply with as many lines as ``example``, or more."""
+        *others, last = bytes(data).split(self.terminator, example.count("\n"))
+        return [self.decode(line) for line in (*(each + self.terminator for each in others), last)]
+
     def _text(self, part: Bytes) -> str:
         body = bytes(part)
         if len(body) > self.size_max:
@@ -108,12 +137,66 @@ class LineFormat:
         return text[:split]
 
 
-def parse_number(text: str) -> float:
+@dataclass(frozen=True)
+class FrameFormat:
+    """Format of one frame, whose text is its bytes in hexadecimal: ``bytes | checksum``."""
+
+    check: Crc = CRCS["none"]
+    NAME: ClassVar[str] = "frame"
+
+    def encode(self, text: str) -> bytes:
+        """Return a frame."""
+        data = bytes.fromhex(text)
+        return data + self.check.of(data)
+
+    def decode(self, frame: Bytes) -> str:
+        """Return the text of exactly one frame; raise CorruptError if its checksum is wrong."""
+        end = len(frame) - self.check.size
+        data, sent = bytes(frame[:end]), bytes(frame[end:])
+        if sent != self.check.of(data):
+            raise CorruptError(f"{self.check.name} of {as_text(data)} is wrong")
+        return as_text(data)
+
+    def size(self, text: str) -> int:
+        """Return the bytes of a text of one or more frames on the wire."""
+        return len(b"".join(map(self.encode, text.split("\n"))))
+
+    def missing(self, example: str) -> Missing:
+        """Return how much is missing of a frame as long as ``example``."""
+        size = self.size(example)
+        return lambda got: max(0, size - len(got))
+
+    def split(self, data: Bytes, example: str) -> list[str]:
+        """Return the text of a reply."""
+        del example
+        return [self.decode(data)]
+
+
+MessageFormat: TypeAlias = LineFormat | FrameFormat
+_FRAME_CHECKS = {**CRCS, "sum8": Crc("sum8", 8, lambda data: sum(data) & 0xFF)}
+
+
+def formats(link: AsciiLink | AsciiTcpLink | BytesLink) -> tuple[MessageFormat, MessageFormat]:
+    """Return the formats of requests and of replies."""
+    if isinstance(link, BytesLink):
+        frames = FrameFormat(_FRAME_CHECKS[link.checksum])
+        return frames, frames
+    return (
+        LineFormat(link.terminator.encode(), link.checksum, link.max_line_chars or 255),
+        LineFormat(link.reply_terminator.encode(), link.checksum),
+    )
+
+
+def parse_number(text: str, binary: RegisterFormat | None = None) -> float:
     """Return the number in a text that is exactly one number; blanks around it are allowed.
+
+    With ``binary`` the text is the number's bytes in hexadecimal; NaN if the device sent it.
 
     Raises:
         CorruptError: Anything else, or SCPI's marks for infinity and not a number.
     """
+    if binary is not None:
+        return binary.decode(bytes.fromhex(text))
     body = text.strip(" ")
     if not _NUMBER.fullmatch(body):
         raise CorruptError(f"must be one number, got {text!r}")
@@ -130,9 +213,11 @@ def reading(form: MeasuredReply, ask: Callable[..., re.Match[str]]) -> float:
     ``ask`` takes forms and returns the match of the reply.
     """
     if form.invalid == "none":
-        return parse_number(ask(form)[1])
+        return parse_number(ask(form)[1], form.binary)
     found = ask(form.invalid, form)
-    return math.nan if form.invalid.match(found.string) else parse_number(found[1])
+    if form.invalid.match(found.string):
+        return math.nan
+    return parse_number(found[1], form.binary)
 
 
 class AsciiSession:
@@ -148,12 +233,10 @@ class AsciiSession:
         address: int | None = None,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        line = profile.link
-        size = line.max_line_chars or 255
         self._profile = profile
-        self._lines = LineFormat(line.terminator.encode(), line.checksum, size)
-        self._replies = LineFormat(line.reply_terminator.encode(), line.checksum)
-        self._echoes = line.echo
+        self._requests, self._replies = formats(profile.link)
+        # An echo of frames is removed by the link.
+        self._echoes = profile.link.echo and not profile.link.settings.echo
         self.address = profile.unit if address is None else address
         self._sleep = sleep
         watchdog = profile.watchdog
@@ -162,17 +245,17 @@ class AsciiSession:
 
     def text(self, template: str, **values: float) -> str:
         """Return a template with its fields filled in."""
-        return template.format(address=self.address, **values)
+        return fill(template, address=self.address, **values)
 
     def line(self, text: str) -> bytes:
-        """Return a text of one or more lines in the form sent on the wire."""
-        return b"".join(map(self._lines.encode, text.split("\n")))
+        """Return a text of one or more messages in the form sent on the wire."""
+        return b"".join(map(self._requests.encode, text.split("\n")))
 
     def send(self, text: str) -> None:
         """Send a text that is not answered."""
         request = self.line(text)
         if self._echoes:
-            self._check_echo(text, self.link.transact(request, self._missing(_lines(text))))
+            self._check_echo(text, self.link.transact(request, self._replies.missing(text)))
         else:
             self.link.transact(request, lambda got: 0)
 
@@ -187,15 +270,15 @@ class AsciiSession:
             MismatchError: It is no answer to this.
             DeviceError: No answer, or a damaged one.
         """
-        return _matched(text, forms, self._transact(text, forms[0].lines))
+        return _matched(text, forms, self._transact(text, forms[0].example))
 
     def query(self, text: str, *forms: Reply) -> re.Match[str]:
         """Ask a question, see :meth:`ask`; a reply that repeats it is a MismatchError."""
-        return _matched(text, forms, self._question(text, forms[0].lines))
+        return _matched(text, forms, self._question(text, forms[0].example))
 
     def number(self, query: Query) -> float:
         """Ask for a number."""
-        return parse_number(self.query(self.text(query.ask), query)[1])
+        return parse_number(self.query(self.text(query.ask), query)[1], query.binary)
 
     def value(self, source: AsciiInput) -> float:
         """Ask for the value of an input, in its unit; NaN if the reading is invalid."""
@@ -236,14 +319,14 @@ class AsciiSession:
     def _ask(self, check: Check) -> tuple[str, str]:
         """Return a question and whatever is answered."""
         text = self.text(check.ask)
-        return text, self._question(text, check.lines)
+        return text, self._question(text, check.example)
 
-    def _question(self, text: str, lines: int) -> str:
+    def _question(self, text: str, example: str) -> str:
         """Return the reply to a question; one that repeats it is a MismatchError.
 
         The line then echoes, and perhaps nothing is connected.
         """
-        reply = self._transact(text, lines)
+        reply = self._transact(text, example)
         if reply == text:
             raise MismatchError(
                 f"{text}: came back unchanged: the line echoes what is sent; set echo: true "
@@ -251,18 +334,16 @@ class AsciiSession:
             )
         return reply
 
-    def _transact(self, text: str, lines: int) -> str:
-        """Send a text and return its reply, which has that many lines and is no error."""
-        expected = lines + (_lines(text) if self._echoes else 0)
+    def _transact(self, text: str, example: str) -> str:
+        """Send a text and return its reply, which is as long as ``example`` and no error."""
+        missing = self._replies.missing(f"{text}\n{example}" if self._echoes else example)
         try:
-            data: bytes | bytearray = self.link.transact(self.line(text), self._missing(expected))
+            data: bytes | bytearray = self.link.transact(self.line(text), missing)
         except NoAnswerError as error:
             raise NoAnswerError(f"{text}: {error}") from None
         if self._echoes:
             data = self._check_echo(text, data)
-        end = self._replies.terminator
-        *others, last = data.split(end, lines - 1)
-        replies = [self._replies.decode(line) for line in (*(each + end for each in others), last)]
+        replies = self._replies.split(data, example)
         for reply in replies:
             self._check_trouble(text, reply)
         return "\n".join(replies)
@@ -298,21 +379,12 @@ class AsciiSession:
         if who and text[1:3] == f"{self.address:02X}" and who[1] != text[1:3]:
             raise MismatchError(f"{text}: answered by address {who[1]}: {reply!r}")
 
-    def _missing(self, lines: int) -> Callable[[bytearray], int]:
-        end = self._replies.terminator
-
-        def missing(got: bytearray) -> int:
-            if len(got) > (lines + 1) * self._replies.size_max:
-                raise CorruptError(f"no end of line within {len(got)} bytes")
-            return max(0, lines - got.count(end))
-
-        return missing
-
     def _check_echo(self, text: str, data: bytes | bytearray) -> bytes | bytearray:
+        assert isinstance(self._replies, LineFormat)
         end = self._replies.terminator
         *echo, rest = data.split(end, _lines(text))
         if [bytes(line).strip(b"\r\n") for line in echo] != [
-            line.rstrip(b"\r\n") for line in map(self._lines.encode, text.split("\n"))
+            line.rstrip(b"\r\n") for line in map(self._requests.encode, text.split("\n"))
         ]:
             raise CorruptError(f"{text}: came back as {bytes(end.join(echo))!r}")
         return rest
@@ -338,7 +410,8 @@ def exchange_time(profile: AsciiProfile, output: str, sensor: str | None) -> Wir
     channel, combined = profile.outputs[output], profile.exchange
 
     def longest(template: str) -> str:
-        texts = (template.format(value=v, address=profile.unit) for v in channel.limits)
+        numbers = map(channel.number, channel.limits)
+        texts = (fill(template, value=number, address=profile.unit) for number in numbers)
         return max(texts, key=len)
 
     settle_s = channel.settle_s + (profile.inputs[sensor].settle_s if sensor else 0.0)
@@ -409,23 +482,19 @@ def _example(reply: Reply | Literal["none"]) -> str | None:
 
 
 def _question(profile: AsciiProfile, query: Query) -> _Line:
-    return query.ask.format(address=profile.unit), query.example
+    return fill(query.ask, address=profile.unit), query.example
 
 
 def _lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float = 0.0) -> WireTime:
     """Return the time of lines with their replies, one after the other."""
     link = profile.link
-    check = _CHECKSUM_CHARS[link.checksum]
-
-    def chars(texts: Iterable[str], end: str) -> int:
-        return sum(len(line) + check + len(end) for text in texts for line in text.split("\n"))
-
-    sent = chars((text for text, _ in lines), link.terminator)
+    requests, answers = formats(link)
     replies = [reply for _, reply in lines if reply is not None]
-    received = chars(replies, link.reply_terminator)
+    sent = sum(requests.size(text) for text, _ in lines)
+    received = sum(map(answers.size, replies))
     count = sum(_lines(text) for text, _ in lines)
     return WireTime(
-        f"{count} {'line' if count == 1 else 'lines'} {link.medium}",
+        f"{count} {requests.NAME}{'' if count == 1 else 's'} {link.medium}",
         sent * link.char_s,
         received * link.char_s,
         len(lines) if link.silence_s else 0,
@@ -443,8 +512,8 @@ def _steps_time(
     lines: list[_Line] = []
     for step in steps:
         if isinstance(step, AskStep | NumberStep):
-            lines.append((step.ask.format(**values), step.example))
+            lines.append((fill(step.ask, **values), step.example))
         elif isinstance(step, SendStep):
-            lines.append((step.text.format(**values), _example(step.reply)))
+            lines.append((fill(step.text, **values), _example(step.reply)))
     waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
     return _lines_time(profile, lines).waiting(waits_s)

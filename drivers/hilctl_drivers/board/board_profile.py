@@ -1,6 +1,6 @@
 """Profiles of microcontroller boards; messages are in :mod:`hilctl_drivers.board.frames`."""
 
-from typing import ClassVar, Literal, Self, TypeAlias
+from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -8,8 +8,7 @@ from hilctl.base.strict import StrictModel
 from hilctl_drivers.board.frames import exchange_sizes
 from hilctl_drivers.modbus.register_map import RegisterFormat, RegisterType
 from hilctl_drivers.profile_base import BaseProfile, BinaryLineSettings, Name, Range, Watchdog
-
-CrcName: TypeAlias = Literal["crc16_modbus", "crc16_ccitt_false", "crc16_xmodem", "crc32", "none"]
+from hilctl_drivers.transport.crc import CrcName
 
 
 class FramesLink(BinaryLineSettings):

@@ -133,7 +133,7 @@ class _Plan:
     def _may_share(self, wanted: ReaderLine | None) -> bool:
         """Return whether the reader is on the line of the device; raise InputError if it can't."""
         profile, reader = self._profile, self._reader
-        alike = type(profile) is type(reader) and not isinstance(reader, FrameProfile)
+        alike = type(profile) is type(reader) and reader.link.kind not in {"bytes", "frames"}
         if wanted == "same" and not alike:
             raise InputError(f"{reader.title} can't share the line of {profile.title}: use own")
         shares = wanted or ("same" if reader.link.kind == "rtu" else "own")

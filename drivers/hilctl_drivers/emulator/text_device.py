@@ -1,60 +1,36 @@
-"""An emulated device with a text protocol: a profile's templates in front of the rig."""
+"""An emulated device of text or fixed frames: a profile's templates in front of the rig."""
 
 import re
-from string import Formatter
 
 from hilctl_drivers.ascii.ascii_profile import (
     AsciiInput,
     AsciiProfile,
     AsciiStep,
     AskStep,
+    BytesLink,
     MeasuredReply,
     NumberStep,
     Reply,
     SendStep,
+    as_text,
+    pattern_of,
 )
 from hilctl_drivers.emulator.rig import Bench, EmulatedDevice
-from hilctl_drivers.emulator.wire import EmulatedReply
+from hilctl_drivers.emulator.wire import EmulatedReply, TemplateMatcher
 
-_NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
 _OUT_OF_RANGE = '-222,"Data out of range"'
 _UNDEFINED = '-113,"Undefined header"'
 _REFUSED = '-200,"Execution error"'
 
 
-class TemplateMatcher:
-    """Reads the fields of lines that were made with a template, sent to ``address``."""
-
-    def __init__(self, text: str, address: int) -> None:
-        self._bases: dict[str, int] = {}
-        parts = []
-        for literal, field, spec, _ in Formatter().parse(text):
-            parts.append(re.escape(literal))
-            if field == "address":
-                parts.append(re.escape(format(address, spec or "")))
-            elif field is not None:
-                hexadecimal = (spec or "").endswith(("X", "x"))
-                self._bases[field] = 16 if hexadecimal else 10
-                group = r"[0-9A-Fa-f]+" if hexadecimal else _NUMBER
-                parts.append(f"(?P<{field}>{group})")
-        self._pattern = re.compile("".join(parts), re.ASCII)
-
-    def match(self, text: str) -> dict[str, float] | None:
-        """Return the fields of a line, or None if it is another one."""
-        found = self._pattern.fullmatch(text)
-        if found is None:
-            return None
-        return {
-            name: float(int(value, 16)) if self._bases[name] == 16 else float(value)
-            for name, value in found.groupdict().items()
-        }
-
-
 def in_style(example: str, pattern: str, value: float) -> str:
     """Return a reply like ``example``, with ``value`` where the pattern's group is."""
-    found = re.fullmatch(pattern, example, re.ASCII)
+    regex, binary = pattern_of(pattern)
+    found = regex.fullmatch(example)
     assert found is not None, "a profile's examples match their patterns"
     start, stop = found.span(1)
+    if binary is not None:
+        return example[:start] + as_text(binary.encode(value)) + example[stop:]
     model = example[start:stop]
     sign = "+" if model[0] in "+-" else ""
     if "E" in model.upper():
@@ -118,6 +94,8 @@ class EmulatedText(EmulatedDevice):
 
     def wrong_id(self, reply: bytes) -> bytes:
         """Return a reply from another address, or to another question if it has no address."""
+        if isinstance(self.profile.link, BytesLink):
+            return b"FF" + reply[2:]
         own = f"{self._address:02X}".encode()
         if len(reply) >= 3 and reply[1:3] == own:
             return reply[:1] + f"{self._address ^ 3:02X}".encode() + reply[3:]
@@ -137,7 +115,8 @@ class EmulatedText(EmulatedDevice):
             readback = output.readback
             if readback != "none" and self._matches(readback.ask, text):
                 said = self._values if readback.of == "output" else self._commands
-                return in_style(readback.example, readback.pattern, said[name])
+                number = output.number(said[name])
+                return in_style(readback.example, readback.pattern, number)
         combined = self.profile.exchange
         if combined == "none":
             return None
@@ -148,8 +127,9 @@ class EmulatedText(EmulatedDevice):
         reply = self._said(combined.input, source, combined)
         return self._set(combined.output, fields["value"], reply)
 
-    def _set(self, name: str, value: float, reply: str) -> str:
+    def _set(self, name: str, number: float, reply: str) -> str:
         watchdog, output = self.profile.watchdog, self.profile.outputs[name]
+        value = output.value(number)
         if self.tripped and watchdog != "none" and watchdog.refuses_while_tripped:
             return "" if watchdog.refusal == "none" else watchdog.refusal.example
         if watchdog != "none" and watchdog.kick == "write":
@@ -183,7 +163,7 @@ class EmulatedText(EmulatedDevice):
         else:
             value = 0.0
         value = min(max(value, source.min), source.max)
-        return (value - source.offset) / source.scale
+        return source.number(value)
 
     def _watchdog(self, text: str) -> str | None:
         watchdog = self.profile.watchdog
@@ -202,7 +182,8 @@ class EmulatedText(EmulatedDevice):
         for name, steps in watchdog.safe.items():
             for step in steps:
                 if isinstance(step, NumberStep) and self._matches(step.ask, text):
-                    return in_style(step.example, step.pattern, self._safe[name])
+                    number = self.profile.outputs[name].number(self._safe[name])
+                    return in_style(step.example, step.pattern, number)
         return None
 
     def _switch(self, name: str, template: str, text: str) -> None:

@@ -1,14 +1,26 @@
 """Parsing of requests and framing of replies: the contract, and devices on a serial line."""
 
+import re
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
+from functools import partial
+from string import Formatter
 from typing import Protocol, TypeAlias
 
-from hilctl_drivers.ascii.ascii_profile import AsciiProfile
-from hilctl_drivers.ascii.ascii_session import LineFormat
+from hilctl_drivers.ascii.ascii_profile import (
+    SAMPLES,
+    AsciiProfile,
+    as_text,
+    binary_format,
+    fill,
+)
+from hilctl_drivers.ascii.ascii_session import FrameFormat, formats, parse_number
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
-from hilctl_drivers.transport.framing import Splitter, binary_framing
+from hilctl_drivers.transport.crc import Bytes
+from hilctl_drivers.transport.framing import PrefixedSplitter, Splitter, binary_framing
 from hilctl_drivers.transport.links import CorruptError
+
+_NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -78,6 +90,59 @@ class SerialDevice(Protocol):
         ...
 
 
+class TemplateMatcher:
+    """Reads the fields of lines that were made with a template, sent to ``address``."""
+
+    def __init__(self, text: str, address: int) -> None:
+        self._parse: dict[str, Callable[[str], float]] = {}
+        self.size = len(fill(text, **SAMPLES | {"address": address}))
+        """Characters of a line; of frames all have as many."""
+        parts = []
+        for literal, field, spec, _ in Formatter().parse(text):
+            parts.append(re.escape(literal))
+            if field == "address":
+                parts.append(re.escape(format(address, spec or "")))
+            elif field is not None:
+                group, self._parse[field] = _field(spec or "")
+                parts.append(f"(?P<{field}>{group})")
+        self._pattern = re.compile("".join(parts), re.ASCII)
+
+    def match(self, text: str) -> dict[str, float] | None:
+        """Return the fields of a line, or None if it is another one."""
+        found = self._pattern.fullmatch(text)
+        if found is None:
+            return None
+        return {name: self._parse[name](each) for name, each in found.groupdict().items()}
+
+
+def _field(spec: str) -> tuple[str, Callable[[str], float]]:
+    """Return what a field matches, and what returns its number."""
+    binary = binary_format(spec)
+    if binary is not None:
+        return rf"[0-9A-F ]{{{3 * binary.size - 1}}}", partial(parse_number, binary=binary)
+    if spec.endswith(("X", "x")):
+        return "[0-9A-Fa-f]+", partial(int, base=16)
+    return _NUMBER, float
+
+
+def _frame_splitter(form: FrameFormat, profile: AsciiProfile) -> PrefixedSplitter:
+    """Return a splitter of a profile's requests, the longest first; it yields their texts."""
+    lines = [line for _, text in profile.requests() for line in text.split("\n")]
+    known = [TemplateMatcher(line, profile.unit) for line in lines]
+    known.sort(key=lambda each: -each.size)
+
+    def size_at(data: Bytes, at: int) -> int:
+        text = as_text(bytes(data[at:]))
+        for each in known:
+            if each.match(text[: each.size]) is not None:
+                return (each.size + 1) // 3 + form.check.size
+        if len(text) >= known[0].size:
+            raise CorruptError("no request begins here")
+        return 0
+
+    return PrefixedSplitter(size_at, lambda frame: form.decode(frame).encode())
+
+
 class EmulatedLine:
     """Devices on a serial line with the profile's framing; the addressed one answers."""
 
@@ -91,8 +156,13 @@ class EmulatedLine:
             framing = binary_framing(link.framing, link.crc, link.payload_max)
             self._splitter, self._encode = framing.splitter(), framing.encode
         else:
-            self._splitter = LineFormat(link.terminator.encode(), link.checksum).splitter()
-            replies = LineFormat(link.reply_terminator.encode(), link.checksum)
+            assert isinstance(profile, AsciiProfile)
+            requests, replies = formats(link)
+            self._splitter = (
+                _frame_splitter(requests, profile)
+                if isinstance(requests, FrameFormat)
+                else requests.splitter()
+            )
             self._encode = lambda message: replies.encode(message.decode())
 
     def tick(self, now_ns: int) -> None:

@@ -16,9 +16,11 @@ from binascii import crc_hqx
 from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from types import MappingProxyType
-from typing import TypeAlias
+from typing import Literal, TypeAlias
 
 Bytes: TypeAlias = bytes | bytearray | memoryview
+CrcName: TypeAlias = Literal["crc16_modbus", "crc16_ccitt_false", "crc16_xmodem", "crc32", "none"]
+"""Names of CRCs in profiles."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -30,7 +30,8 @@ class SerialSettings:
     Attributes:
         gap_s: Silence to keep between a reply and the next request.
         boot_s: Wait after opening the port, for boards that reset then.
-        flow: Flow control. With xonxoff, bytes 0x11 and 0x13 are signals and never data.
+        flow: Flow control. With xonxoff, bytes 0x11 and 0x13 are signals and never data; with
+            rts_cts, the lines RTS and CTS are.
         dtr: Level to hold DTR at; None to raise it, as opening a port does.
         rts: Level to hold RTS at, likewise.
         rs485: Level of RTS while sending, which the kernel then switches.
@@ -43,7 +44,7 @@ class SerialSettings:
     stopbits: Literal[1, 2] = 1
     gap_s: float = 0.0
     boot_s: float = 0.0
-    flow: Literal["none", "xonxoff"] = "none"
+    flow: Literal["none", "xonxoff", "rts_cts"] = "none"
     dtr: bool | None = None
     rts: bool | None = None
     rs485: Literal["high", "low"] | None = None
@@ -64,6 +65,7 @@ def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.
         settings.stopbits,
         timeout=0.0,
         xonxoff=settings.flow == "xonxoff",
+        rtscts=settings.flow == "rts_cts",
         write_timeout=timeout_s,
         exclusive=True,
     )
@@ -174,8 +176,8 @@ class SerialLink(StreamLink):
         port, self._port, self._fd = self._port, None, -1
         if port is None:
             return
-        if self._stale and self._settings.flow == "xonxoff":
-            # Closing waits for bytes that a device with its XOFF out never takes, 30 s and more.
+        if self._stale and self._settings.flow != "none":
+            # Closing waits for bytes that a pausing device never takes, 30 s and more.
             import termios
 
             with contextlib.suppress(termios.error):  # where the port is gone

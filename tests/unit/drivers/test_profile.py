@@ -57,7 +57,8 @@ inputs:
 watchdog: none
 """
 BOARD = (FOLDER / "cobs_board_fifo.yaml").read_text(encoding="utf-8")
-TEXTS = {"modbus": MODBUS, "ascii": ASCII, "board": BOARD}
+BYTES = (FOLDER / "npoint_lc400.yaml").read_text(encoding="utf-8")
+TEXTS = {"modbus": MODBUS, "ascii": ASCII, "board": BOARD, "bytes": BYTES}
 
 
 def changed(base, changes):
@@ -89,7 +90,7 @@ WATCHDOG = {
     "arm": [{"kind": "write", "address": 9, "type": "uint16", "value": "timeout"}],
 }  # fmt: skip
 
-KINDS = "link.kind: must be one of ascii, ascii_tcp, frames, rtu, rtu_tcp, sensor_stream, tcp"
+KINDS = "must be one of ascii, ascii_tcp, bytes, frames, rtu, rtu_tcp, sensor_stream, tcp"
 
 BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"vendor": None}, "vendor: is required"),
@@ -184,6 +185,15 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
                             "example": "1"}}, "exchange.write must have the field {value}"),
     ("ascii", {"outputs": {}, "inputs": {}}, ": must have outputs or inputs, or both"),
     ("ascii", {"link.terminator": ";"}, "link.terminator: must be one of"),
+    ("bytes", {"init": [{"kind": "send", "text": "a2 55"}]}, "init.0.text: must be bytes in upper"),
+    ("bytes", {"selftest.example": "A0 78 10 83 11 64 00 00 00 5", "selftest.pattern": ".*"},
+     "selftest.example: must be bytes in upper"),
+    ("bytes", {"inputs.position1.ask": "POS?"}, "inputs.position1.ask: must be bytes in upper"),
+    ("bytes", {"outputs.axis1.write": "A2 {value:int16} 55"}, "int16 register holds"),
+    ("bytes", {"outputs.axis1.write": "A2 {value:int24} 55"}, "outputs.axis1.write: "),
+    ("bytes", {"outputs.axis1.write": "A2 {value:int32 BA} 55"}, "order of int32 must name"),
+    ("bytes", {"inputs.position1.pattern": "A0 {value:int8}"}, "must have a type of int16"),
+    ("bytes", {"link.flow": "xonxoff"}, "flow must not be xonxoff"),
     ("ascii", {"watchdog": {**{k: v for k, v in WATCHDOG.items() if k != "arm"},
                             "kick": "strict", "arm": [{"kind": "send", "text": "W{timeout}"}]}},
      "feed steps and kick: strict go together"),

@@ -9,9 +9,11 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.ascii.ascii_profile import Reply
 from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
+    FrameFormat,
     LineFormat,
     exchange_time,
     feed_time,
+    formats,
     parse_number,
 )
 from hilctl_drivers.profile import load_profile, with_link
@@ -313,3 +315,50 @@ def test_a_refusal_is_no_invalid_reading():
     source = PLAIN.inputs["AI0"].model_copy(update={"invalid": invalid})
     with pytest.raises(links.RefusedError):
         session(b"?02\r").value(source)
+
+
+NPOINT = load_profile("npoint_lc400")
+
+
+@pytest.mark.parametrize(("reply", "counts"), [
+    # Captured from a controller
+    ("a0341383110401000055", 260), ("a03413831112ffffff55", -238), ("a034138311f003000055", 1008),
+])  # fmt: skip
+def test_frames_as_captured(reply, counts):
+    asked = session(bytes.fromhex(reply), profile=NPOINT)
+    assert asked.number(NPOINT.inputs["position1"]) == counts
+    assert asked.link.sent == [bytes.fromhex("a03413831155")]
+    assert [asked.link.missing(bytearray(n)) for n in (0, 9, 10)] == [10, 1, 0]
+
+
+@pytest.mark.parametrize("reply", ["a0342383110401000055", "a0341383110401000054", "a034138311"])
+def test_a_frame_must_match_its_pattern(reply):
+    with pytest.raises(links.MismatchError):
+        session(bytes.fromhex(reply), profile=NPOINT).number(NPOINT.inputs["position1"])
+
+
+def test_frames_of_one_write():
+    asked = session(bytes.fromhex("a0341383110401000055"), profile=NPOINT)
+    combined = NPOINT.exchange
+    asked.ask(asked.text(combined.write, value=1000.0), combined)
+    assert asked.link.sent == [bytes.fromhex("a218128311e803000055a03413831155")]
+    time = exchange_time(NPOINT, "axis1", "position1")
+    assert time.what == "2 frames at 115200 8N1"
+    assert wire_s(time) == pytest.approx((10 + 6 + 10) * 10 / 115200)
+
+
+@pytest.mark.parametrize(("checksum", "wire"), [
+    # BK Precision 1785B: remote control on, address 0, in 26 bytes; CRC-16/MODBUS of 01 03
+    ("sum8", "aa002001" + "00" * 21 + "cb"), ("crc16_modbus", "01034021"), ("none", "aa55"),
+])  # fmt: skip
+def test_checksums_of_frames(checksum, wire):
+    link = NPOINT.link.model_copy(update={"checksum": checksum})
+    request, reply = formats(link)
+    assert isinstance(reply, FrameFormat)
+    data = bytes.fromhex(wire)
+    text = reply.decode(data)
+    assert request.encode(text) == data
+    assert request.size(f"{text}\n{text}") == 2 * len(data)
+    if reply.check.size:
+        with pytest.raises(links.CorruptError):
+            reply.decode(b"\1" + data[1:-1] + b"\2")

@@ -4,7 +4,8 @@ from pathlib import Path
 
 import pytest
 
-from hilctl_drivers.emulator.text_device import TemplateMatcher, in_style
+from hilctl_drivers.emulator.text_device import in_style
+from hilctl_drivers.emulator.wire import TemplateMatcher
 from tests.unit.drivers.emulator.conftest import MS, START_NS
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()

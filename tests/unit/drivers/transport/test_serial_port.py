@@ -52,14 +52,18 @@ def test_modem_lines_are_set_before_the_board_starts(line, levels):
     assert seen == [(2.0, [("dtr", False), ("rts", True)])]
 
 
-@pytest.mark.parametrize("flow", ["none", "xonxoff"])
-def test_flow_control_is_set_both_ways(line, flow):
+CRTSCTS = termios.CRTSCTS
+FLOWS = {"none": (0, 0), "xonxoff": (termios.IXON | termios.IXOFF, 0), "rts_cts": (0, CRTSCTS)}
+
+
+@pytest.mark.parametrize("other", FLOWS)
+@pytest.mark.parametrize("flow", FLOWS)
+def test_flow_control_is_set_both_ways(line, flow, other):
     _, name = line
-    other = "none" if flow == "xonxoff" else "xonxoff"
     serial(name, flow=other).close()
     link = serial(name, flow=flow)
-    wanted = termios.IXON | termios.IXOFF if flow == "xonxoff" else 0
-    assert termios.tcgetattr(link._fd)[0] & (termios.IXON | termios.IXOFF) == wanted
+    iflag, _, cflag, *_ = termios.tcgetattr(link._fd)
+    assert (iflag & (termios.IXON | termios.IXOFF), cflag & CRTSCTS) == FLOWS[flow]
     link.close()
 
 
@@ -150,9 +154,16 @@ def test_profiles_say_how_their_line_is_set():
 
 @pytest.mark.parametrize("name", ["icp_m7024", "cobs_board"])
 def test_binary_lines_refuse_flow_control(name):
-    rule = "flow must be none if bytes 0x11 and 0x13 are data, got xonxoff"
-    with pytest.raises(InputError, match=rule):
+    with pytest.raises(InputError, match="flow must not be xonxoff"):
         with_link(load_profile(name), flow="xonxoff")
+
+
+@pytest.mark.parametrize("change", [{"rts": True}, {"rs485": "high"}])
+def test_rts_is_either_flow_control_or_a_level(change):
+    profile = load_profile("npoint_lc400")
+    assert with_link(profile, flow="rts_cts").link.settings.flow == "rts_cts"
+    with pytest.raises(InputError, match="rs485 must be omitted"):
+        with_link(profile, flow="rts_cts", **change)
 
 
 def test_levels_stay_when_the_port_of_a_board_that_boots_is_closed(line):
