@@ -26,7 +26,7 @@ SERIAL = (
     "kepco_bop agilent_34970a own", "tdk_lambda_gen agilent_34970a own",
     "kepco_bop labjack_t7 own", "icp_m7024_dcon adam_4117 own", "cobs_board labjack_t7 own",
     "kepco_bop cobs_board own", "magna_power_sl keyence_cl3000 own",
-    "kepco_bop capancdt_6200 own",
+    "kepco_bop capancdt_6200 own", "bk_precision_1785b agilent_34970a own",
 )  # fmt: skip
 """What serial_dac is tried with: what drives, what reads, and whether they share a line."""
 PIEZO = (
@@ -62,7 +62,7 @@ TIMEOUT_S = 2.0
 STREAM_RATE_HZ = 640.0
 BLOCK = 10
 FIFO_BLOCKS = 32  # 500 ms, the longest stall of a busy machine
-MUST_BE_AT_REST = {"kepco_bop", "magna_power_sl", "tdk_lambda_gen"}
+MUST_BE_AT_REST = {"bk_precision_1785b", "kepco_bop", "magna_power_sl", "tdk_lambda_gen"}
 
 
 def serial_profiles():

@@ -14,10 +14,10 @@ from hilctl_drivers.profile import FOLDER, link_kinds, load_profile, profile_cla
 
 NAMES = (
     "acromag_962en", "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217",
-    "adam_6224", "agilent_34970a", "beckhoff_bk9000", "capancdt_6200", "cobs_board",
-    "cobs_board_fifo",
-    "generic_float32", "icp_et7000", "icp_m7017", "icp_m7024", "icp_m7024_dcon", "kepco_bop",
-    "keyence_cl3000", "labjack_t4", "labjack_t7", "labjack_t8", "magna_power_sl",
+    "adam_6224", "agilent_34970a", "beckhoff_bk9000", "bk_precision_1785b", "capancdt_6200",
+    "cobs_board", "cobs_board_fifo", "generic_float32", "icp_et7000", "icp_m7017", "icp_m7024",
+    "icp_m7024_dcon", "kepco_bop", "keyence_cl3000", "labjack_t4", "labjack_t7", "labjack_t8",
+    "magna_power_sl",
     "moxa_iologik_e1240", "npoint_lc400", "pi_e709", "pi_e727", "tdk_lambda_gen", "thorlabs_kpz101",
     "thorlabs_ksg101", "wago_750", "waveshare_ai_8ch", "waveshare_ai_8ch_b", "waveshare_ao_8ch",
     "waveshare_ao_8ch_b",
@@ -269,6 +269,7 @@ def test_flash_is_not_rewritten(modbus, name):
     ("tdk_lambda_gen", "current", 7.07, "PC 7.070"),
     ("pi_e727", "axis1", 12.5, "SVA 1 12.5000"),
     ("magna_power_sl", "current", 2.5, "CURR 2.5000"),
+    ("bk_precision_1785b", "current", 3.12, "AA 00 24 30 0C" + " 00" * 20),
     ("thorlabs_kpz101", "voltage", 75.0, "43 06 04 00 D0 01 01 00 FF 7F"),
     ("thorlabs_kpz101", "voltage", 0.0, "43 06 04 00 D0 01 01 00 00 00"),
     ("npoint_lc400", "axis1", 0.0190735, "A2 18 12 83 11 E8 03 00 00 55"),

@@ -9,6 +9,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     AskStep,
     BytesLink,
     MeasuredReply,
+    NumberReply,
     NumberStep,
     Reply,
     SendStep,
@@ -40,6 +41,11 @@ def in_style(example: str, pattern: str, value: float) -> str:
         value = round(value, decimals) + 0.0  # no device says -0.000
         number = f"{value:{sign}0{len(model)}.{decimals}f}"
     return example[:start] + number + example[stop:]
+
+
+def _with_number(form: NumberReply, reply: str, number: float) -> str:
+    """Return a reply with its number replaced; the example if it is not of this form."""
+    return in_style(reply if form.match(reply) else form.example, form.pattern, number)
 
 
 class EmulatedText(EmulatedDevice):
@@ -74,7 +80,7 @@ class EmulatedText(EmulatedDevice):
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.kick == "any":
             self._timer.fed_ns = self._now_ns
-        for part in (self._outputs, self._inputs, self._watchdog, self._questions, self._steps):
+        for part in (self._outputs, self._queries, self._watchdog, self._questions, self._steps):
             found = part(text)
             if found is not None:
                 return EmulatedReply(found.encode() or None)
@@ -112,11 +118,6 @@ class EmulatedText(EmulatedDevice):
             if fields is not None:
                 reply = "" if output.reply == "none" else output.reply.example
                 return self._set(name, fields["value"], reply)
-            readback = output.readback
-            if readback != "none" and self._matches(readback.ask, text):
-                said = self._values if readback.of == "output" else self._commands
-                number = output.number(said[name])
-                return in_style(readback.example, readback.pattern, number)
         combined = self.profile.exchange
         if combined == "none":
             return None
@@ -143,17 +144,24 @@ class EmulatedText(EmulatedDevice):
         self._put_out(name, value, "write", self._now_ns)
         return reply
 
-    def _inputs(self, text: str) -> str | None:
+    def _queries(self, text: str) -> str | None:
+        """Return a reply with the numbers of all inputs and outputs that have this query."""
+        reply = ""
         for name, source in self.profile.inputs.items():
             if self._matches(source.ask, text):
-                return self._said(name, source, source)
-        return None
+                reply = self._said(name, source, source, reply)
+        for name, output in self.profile.outputs.items():
+            readback = output.readback
+            if readback != "none" and self._matches(readback.ask, text):
+                said = self._values if readback.of == "output" else self._commands
+                reply = _with_number(readback, reply, output.number(said[name]))
+        return reply or None
 
-    def _said(self, name: str, source: AsciiInput, form: MeasuredReply) -> str:
+    def _said(self, name: str, source: AsciiInput, form: MeasuredReply, reply: str = "") -> str:
         """Return the reply of that form with a reading, or the one that marks it as invalid."""
         if form.invalid != "none" and name == self._sensor and self._is_invalid:
             return form.invalid.example
-        return in_style(form.example, form.pattern, self._reading(name, source))
+        return _with_number(form, reply, self._reading(name, source))
 
     def _reading(self, name: str, source: AsciiInput) -> float:
         if source.measures == "output":

@@ -134,3 +134,25 @@ def test_gen_refuses_with_its_codes(emulate):
     assert supply.ask(b"MC?") == b"05.000"
     assert supply.ask(b"PC 39.000") == b"C05"
     assert supply.ask(b"PC?") == b"05.000"
+
+
+class TestFrames:
+    @pytest.fixture
+    def supply(self, emulate):
+        return emulate("bk_precision_1785b", reader="agilent_34970a")
+
+    def test_one_reply_has_all_numbers(self, supply):
+        """The measured current is in bytes 3 and 4, the commanded one in 10 and 11."""
+        reserved = b" 00" * 20
+        assert supply.ask(b"AA 00 24 C4 09" + reserved).startswith(b"AA 00 12 80 ")
+        words = supply.ask(b"AA 00 26 00 00" + reserved).split()
+        assert words[3:5] == words[10:12] == [b"C4", b"09"]
+        assert supply.ask(b"AA 00 24 89 13" + reserved).startswith(b"AA 00 12 A0 ")
+
+    def test_requests_are_found_behind_rubbish_and_in_parts(self, supply):
+        wire = supply.emulator.wires[0]
+        good = bytes.fromhex("aa002400" + "00" * 21 + "ce")
+        bad = good[:-1] + b"\0"
+        found = [*wire.requests(bytearray(b"\xaa\x00" + bad + good[:7]))]
+        found += wire.requests(bytearray(good[7:] + good))
+        assert found == [good[:-1].hex(" ").upper().encode()] * 2
