@@ -205,8 +205,7 @@ class AsciiDac(SerialDac):
         if value is None:
             return
         fields = Formatter().parse(self._target.write)
-        spec = next(spec for _, field, spec, _ in fields if field == "value")
-        spec = spec or ""
+        spec = next(spec or "" for _, field, spec, _ in fields if field == "value")
         sent = fill(f"{{value:{spec}}}", value=self._target.number(value))
         if self._target.value(parse_number(sent, binary_format(spec))) != value:
             return

@@ -15,7 +15,7 @@ order are those of :mod:`hilctl_drivers.modbus.register_map`. The example shows 
 
 import re
 from collections.abc import Iterator
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from functools import cache
 from string import Formatter
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias, get_args
@@ -54,12 +54,15 @@ def binary_format(spec: str) -> RegisterFormat | None:
     return RegisterFormat(found[1], found[2] or "") if found else None  # type: ignore[arg-type]
 
 
-class _Number(float):
+@dataclass(frozen=True, slots=True)
+class _Field:
     """A number whose format may be a type of :func:`binary_format`: its bytes in hexadecimal."""
+
+    number: float
 
     def __format__(self, spec: str) -> str:
         binary = binary_format(spec)
-        return super().__format__(spec) if binary is None else as_text(binary.encode(self))
+        return format(self.number, spec) if binary is None else as_text(binary.encode(self.number))
 
 
 def as_text(data: bytes) -> str:
@@ -68,14 +71,12 @@ def as_text(data: bytes) -> str:
 
 
 def fill(template: str, **values: float) -> str:
-    """Return a template with its fields filled in; numbers of type float may become bytes.
+    """Return a template with its fields filled in.
 
     Raises:
         BadRequestError: The type of a field cannot hold the value.
     """
-    return template.format(
-        **{name: _Number(v) if isinstance(v, float) else v for name, v in values.items()}
-    )
+    return template.format(**{name: _Field(number) for name, number in values.items()})
 
 
 @cache
@@ -258,6 +259,12 @@ class ScaledRange(Range):
 
     scale: float = 1.0
     offset: float = 0.0
+
+    @model_validator(mode="after")
+    def _has_scale(self) -> Self:
+        if not self.scale:
+            raise ValueError("scale must not be 0")
+        return self
 
     def value(self, number: float) -> float:
         """Return the value of a number on the wire, in ``unit``."""

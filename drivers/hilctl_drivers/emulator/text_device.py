@@ -210,7 +210,9 @@ class EmulatedText(EmulatedDevice):
     def _questions(self, text: str) -> str | None:
         query = self.profile.error_query
         if query != "none" and self._matches(query.ask, text):
-            return self._errors.pop(0) if self._errors else query.example
+            # What an error looks like in bytes, the profile does not say.
+            in_text = not isinstance(self.profile.link, BytesLink)
+            return self._errors.pop(0) if self._errors and in_text else query.example
         test = self.profile.selftest
         return test.example if test != "none" and self._matches(test.ask, text) else None
 

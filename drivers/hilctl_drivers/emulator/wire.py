@@ -101,7 +101,7 @@ class TemplateMatcher:
         for literal, field, spec, _ in Formatter().parse(text):
             parts.append(re.escape(literal))
             if field == "address":
-                parts.append(re.escape(format(address, spec or "")))
+                parts.append(re.escape(fill(f"{{address:{spec}}}", address=address)))
             elif field is not None:
                 group, self._parse[field] = _field(spec or "")
                 parts.append(f"(?P<{field}>{group})")

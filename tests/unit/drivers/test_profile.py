@@ -193,6 +193,7 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("bytes", {"outputs.axis1.write": "A2 {value:int24} 55"}, "outputs.axis1.write: "),
     ("bytes", {"outputs.axis1.write": "A2 {value:int32 BA} 55"}, "order of int32 must name"),
     ("bytes", {"inputs.position1.pattern": "A0 {value:int8}"}, "must have a type of int16"),
+    ("bytes", {"outputs.axis1.scale": 0}, "outputs.axis1: scale must not be 0"),
     ("bytes", {"link.flow": "xonxoff"}, "flow must not be xonxoff"),
     ("ascii", {"watchdog": {**{k: v for k, v in WATCHDOG.items() if k != "arm"},
                             "kick": "strict", "arm": [{"kind": "send", "text": "W{timeout}"}]}},

@@ -30,6 +30,9 @@ class TestTemplates:
         assert TemplateMatcher("CURR {value:.6f};:MEAS:CURR?", 0).match("CURR 1.5;:MEAS:CURR?") == {
             "value": 1.5
         }
+        frame = TemplateMatcher("A2 {address:uint16} {timeout:uint16 BA} {value:int16}", 258)
+        assert frame.match("A2 01 02 64 00 FF FE") == {"timeout": 100.0, "value": -2.0}
+        assert frame.match("A2 01 03 64 00 FF FE") is None
         for other in ("#020-05.250", "#010-05.250 ", "#010", "#011+05.000x"):
             assert TemplateMatcher("#{address:02X}0{value:+07.3f}", 1).match(other) is None
 
