@@ -35,6 +35,7 @@ from hilctl_drivers.profile_base import (
     Watchdog,
 )
 from hilctl_drivers.transport.crc import CrcName
+from hilctl_drivers.transport.links import BadRequestError
 from hilctl_drivers.transport.serial_port import SerialSettings
 
 SAMPLES = {"value": 0.0, "safe": 0.0, "address": 1, "timeout": 1}
@@ -291,7 +292,11 @@ class AsciiOutput(ScaledRange):
         if "value" not in fields_of(self.write):
             raise ValueError("write must have the field {value}")
         for limit in self.limits:
-            fill(self.write, **SAMPLES | {"value": self.number(limit)})
+            try:
+                fill(self.write, **SAMPLES | {"value": self.number(limit)})
+            except BadRequestError as error:
+                value = f"{limit:g} {self.unit} with scale {self.scale:g}"
+                raise ValueError(f"min and max must fit write, got {value}: {error}") from None
         return self
 
 

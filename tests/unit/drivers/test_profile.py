@@ -189,7 +189,7 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("bytes", {"selftest.example": "A0 78 10 83 11 64 00 00 00 5", "selftest.pattern": ".*"},
      "selftest.example: must be bytes in upper"),
     ("bytes", {"inputs.position1.ask": "POS?"}, "inputs.position1.ask: must be bytes in upper"),
-    ("bytes", {"outputs.axis1.write": "A2 {value:int16} 55"}, "int16 register holds"),
+    ("bytes", {"outputs.axis1.write": "A2 {value:int16} 55"}, "min and max must fit write"),
     ("bytes", {"outputs.axis1.write": "A2 {value:int24} 55"}, "outputs.axis1.write: "),
     ("bytes", {"outputs.axis1.write": "A2 {value:int32 BA} 55"}, "order of int32 must name"),
     ("bytes", {"inputs.position1.pattern": "A0 {value:int8}"}, "must have a type of int16"),
