@@ -73,7 +73,7 @@ class SerialLineSettings(StreamSettings):
     flow: Literal["none", "xonxoff", "rts_cts"] = Field(
         default="none",
         description="xonxoff: bytes 0x13 and 0x11 pause and resume the data, for lines of text;"
-        " rts_cts: the lines RTS and CTS do",
+        " rts_cts: handshake by the lines RTS and CTS",
     )
     dtr: bool | None = Field(
         default=None, description="level of DTR; if omitted, raised when the port is opened"

@@ -251,15 +251,10 @@ class Readback(Query):
 
 
 class ScaledRange(Range):
-    """A channel whose value = number * scale + offset.
+    """A channel whose value = number * scale + offset."""
 
-    Attributes:
-        scale: Factor of the number.
-        offset: Added to the scaled number.
-    """
-
-    scale: float = 1.0
-    offset: float = 0.0
+    scale: float = Field(default=1.0, description="factor of the number")
+    offset: float = Field(default=0.0, description="added to the scaled number, in unit")
 
     @model_validator(mode="after")
     def _has_scale(self) -> Self:
@@ -279,7 +274,7 @@ class ScaledRange(Range):
 class AsciiOutput(ScaledRange):
     """An output set by a line of text or a frame; value = number * scale + offset."""
 
-    write: LineTemplate = Field(description="sets it, with {value}, the number")
+    write: LineTemplate = Field(description="sets it; {value} is (value - offset) / scale")
     reply: Reply | Literal["none"] = Field(
         description="form of a good reply; none if there is none"
     )
