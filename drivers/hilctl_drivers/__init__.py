@@ -11,7 +11,7 @@ template.py                 device section of a new experiment
 contract.py                 the device contract as tests, for any package
 transport/                  links, framing, wire time
 modbus/  labjack/           Modbus TCP and RTU, and LabJack streaming
-ascii/  board/              text protocols and binary frames, for ``serial_dac``
+ascii/  board/              text or fixed frames, and boards, for ``serial_dac``
 sensor_stream/              sensors that send unasked
 simulated/  emulator/       simulated rigs, and the same rigs behind real wires
 
