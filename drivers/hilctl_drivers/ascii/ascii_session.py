@@ -13,6 +13,7 @@ from functools import partial
 from typing import ClassVar, Literal, TypeAlias
 
 from hilctl.base.errors import DeviceError
+from hilctl.base.formatting import printable
 from hilctl_drivers.ascii.ascii_profile import (
     AsciiInput,
     AsciiLink,
@@ -340,7 +341,7 @@ class AsciiSession:
         try:
             data: bytes | bytearray = self.link.transact(self.line(text), missing)
         except NoAnswerError as error:
-            raise NoAnswerError(f"{text}: {error}") from None
+            raise NoAnswerError(f"{printable(text)}: {error}") from None
         if self._echoes:
             data = self._check_echo(text, data)
         replies = self._replies.split(data, example)
@@ -369,6 +370,7 @@ class AsciiSession:
                 raise DeviceError(f"{rule}, got {found:g}")
 
     def _check_trouble(self, text: str, reply: str) -> None:
+        text = printable(text)
         if self._refusal != "none" and self._refusal.match(reply):
             said = "ignored, the host watchdog has tripped: output is at its safe value"
             raise WatchdogTrippedError(f"{text}: {said}", reply)
@@ -397,7 +399,7 @@ def _lines(text: str) -> int:
 def _matched(text: str, forms: Sequence[Reply], reply: str) -> re.Match[str]:
     found = next(filter(None, (form.match(reply) for form in forms)), None)
     if found is None:
-        raise MismatchError(f"{text}: not an answer to this: {reply!r}")
+        raise MismatchError(f"{printable(text)}: not an answer to this: {reply!r}")
     return found
 
 

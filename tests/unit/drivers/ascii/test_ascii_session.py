@@ -126,10 +126,12 @@ def test_several_lines_are_one_write():
     (b"1=1.5 \r?\r", links.RefusedError),
     (b"1=1.5 \r3=3\r", links.MismatchError),
     (b"1=1.5 \r2=3\r4", links.CorruptError),
+    (None, links.NoAnswerError),
 ])  # fmt: skip
 def test_each_line_of_a_reply_is_checked(reply, error):
-    with pytest.raises(error):
+    with pytest.raises(error) as caught:
         session(reply).ask("SVA 1 5\nPOS? 1 2", LINES)
+    assert "\n" not in str(caught.value)
 
 
 def test_an_echo_may_have_several_lines():
