@@ -16,6 +16,7 @@ from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
+from itertools import chain
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated
 
@@ -109,20 +110,22 @@ def rests_at(model: HysteresisModel, sample_rate_hz: float, command: float) -> f
 
 
 def initial_state_after(
-    path: Path, model: HysteresisModel, sample_rate_hz: float, now_s: float
+    path: Path, model: HysteresisModel, sample_rate_hz: float, now_s: float, safe: float
 ) -> InitialState:
     """Return the state of the actuator after a recorded run that began at rest.
 
     The model converts all of its commands to displacements, and the inverse follows those, so the
-    run may have used any compensator or none. Creep decays from the end of the run to ``now_s``, a
-    Unix time, for at least one second.
+    run may have used any compensator or none. The output then moves to ``safe``, the safe value
+    of the next run. Creep decays from the end of the run to ``now_s``, a Unix time, for at least
+    one second.
 
     Raises:
         DataError: The recording is unreadable or incomplete, or its commands do not fit.
         ModelError: The model has no inverse.
     """
     followed = _Followed(path, model, sample_rate_hz)
-    left = left_by(followed.commands(), model, sample_rate_hz, lambda: now_s - followed.ended_s)
+    commands = chain(followed.commands(), [np.array([safe])])
+    left = left_by(commands, model, sample_rate_hz, lambda: now_s - followed.ended_s)
     if not math.isfinite(left.stands_um):
         raise DataError(f"{path}: has commands beyond the range of the model")
     return replace(left, run_id=followed.run_id)
@@ -178,7 +181,7 @@ class _Followed:
         """Unix time of its end in s, known after all commands were read."""
 
     def commands(self) -> Iterator[F64]:
-        """Yield the commands in order."""
+        """Yield the commands in order, then the safe value."""
         from hilctl.recording.reader import RecordingStream  # slow to import, rarely needed
 
         samples, whole, unanswered = 0, True, False
@@ -195,6 +198,8 @@ class _Followed:
         if unanswered or piece.end.get("output_safe") == "false":
             lost = "lost its device, or did not confirm its safe value"
             raise DataError(f"{self._path}: {lost}: the state of the actuator is unknown")
+        if "safe_value" in piece.run:  # the guardian's, if it took over, is not a sample
+            yield np.array([float(piece.run["safe_value"])])
         self.run_id = piece.run.get("run_id", "")
         with suppress(ValueError):  # absent in old recordings: one second is simulated
             self.ended_s = datetime.fromisoformat(piece.end.get("ended", "")).timestamp()
@@ -289,7 +294,7 @@ def left_by_last_run(loaded: LoadedExperiment, now_s: float) -> tuple[InitialSta
     path = Path(state.recording)
     try:
         _check_run(state)
-        left = initial_state_after(path, model, config.sample_rate_hz, now_s)
+        left = initial_state_after(path, model, config.sample_rate_hz, now_s, config.safe.value)
     except (DataError, OSError) as error:
         return None, f"at rest, because the state after the last run is unknown: {error}"
     return left, f"where {path} left the actuator"

@@ -192,7 +192,9 @@ def _state_before(
     elif named != "rest":
         begins = f"where {named} left the actuator"
         try:
-            before = initial_state_after(loaded.folder / named, model, rate_hz, now_s)
+            before = initial_state_after(
+                loaded.folder / named, model, rate_hz, now_s, config.safe.value
+            )
         except DataError as error:
             problems.append(loaded.problem("compensator.initial_state", str(error)))
     if before is None and conditioned.size:

@@ -359,7 +359,7 @@ def _initial_state(recording: Recording, path: Path) -> None:
     model = PpiModel(
         direct=2.0, weights=(0.5,), thresholds=(0.1,), input_unit=recording.command_unit
     )
-    initial_state_after(path, model, recording.sample_rate_hz, 2e9)
+    initial_state_after(path, model, recording.sample_rate_hz, 2e9, 0.0)
 
 
 COMMANDS: dict[str, Callable[[Recording, Path], None]] = {

@@ -129,7 +129,7 @@ def test_another_model_is_fed_by_its_own_preview(ahead, recording):
 
 def test_run_that_goes_on_after_another_is_identical(ahead, tmp_path):
     """Begun with what a run before left, a run records that memory, and replays from it."""
-    memory = initial_state_after(ahead.path, STAGED, ahead.sample_rate_hz, time.time())
+    memory = initial_state_after(ahead.path, STAGED, ahead.sample_rate_hz, time.time(), 0.0)
     after = record(tmp_path, STAGED, 0.1, ahead.path)
     begun = Compensator(STAGED, ahead.sample_rate_hz)
     begun.restore(memory.state)

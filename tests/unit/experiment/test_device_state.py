@@ -86,9 +86,13 @@ def write_recording(
     return path
 
 
+def state_after(path, model, rate_hz=RATE_HZ, safe=0.0):
+    return initial_state_after(path, model, rate_hz, LATER_S, safe)
+
+
 @pytest.mark.parametrize("model", [OMEGA, STAGED], ids=["integrated", "staged"])
 def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
-    memory = initial_state_after(record(tmp_path / "run.mcap", COMMAND), model, RATE_HZ, LATER_S)
+    memory = state_after(record(tmp_path / "run.mcap", COMMAND), model)
     plant, inverse = model.forward(RATE_HZ), model.inverse(RATE_HZ)
     plant.process(np.concatenate((COMMAND, np.full(20_000, COMMAND[-1]))))
     assert abs(memory.stands_um) > 0.5
@@ -121,13 +125,30 @@ def test_a_run_in_pieces_leaves_what_the_whole_leaves(model):
 ])  # fmt: skip
 def test_what_has_crept_goes_back_until_the_next_run(tmp_path, ended, still_s):
     path = record(tmp_path / "run.mcap", COMMAND, end={"ended": ended})
-    left = initial_state_after(path, CREEPING, RATE_HZ, LATER_S)
-    still = np.full(round(still_s * RATE_HZ), COMMAND[-1])
+    left = state_after(path, CREEPING)
+    still = np.full(round(still_s * RATE_HZ) + 1, COMMAND[-1])
     wanted = left_by([COMMAND, still], CREEPING, RATE_HZ)
     gone = left_by([COMMAND], CREEPING, RATE_HZ)
     assert abs(gone.stands_um - wanted.stands_um) > 0.02
     assert left.stands_um == pytest.approx(wanted.stands_um, abs=1e-6)
     np.testing.assert_allclose(left.state, wanted.state, rtol=0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize(("facts", "safe"), [
+    ({"safe_value": "0.0"}, 0.0),  # set by the guardian, so it is not among the samples
+    ({"safe_value": "-1.0"}, 0.0),
+    ({}, -1.0),
+])  # fmt: skip
+def test_the_output_rests_at_the_safe_value(tmp_path, facts, safe):
+    half = COMMAND[: COMMAND.size // 2]
+    left = state_after(record(tmp_path / "run.mcap", half, facts=facts), STAGED, safe=safe)
+    values = [float(value) for value in (*facts.values(), safe)]
+    still = np.full(round(RATE_HZ), safe)
+    wanted = left_by([half, np.array(values), still], STAGED, RATE_HZ)
+    assert left.stands_um == wanted.stands_um
+    inverse = STAGED.inverse(RATE_HZ)
+    inverse.restore(left.state)
+    assert inverse.process(np.full(10, left.stands_um))[-1] == pytest.approx(safe, abs=1e-6)
 
 
 def test_lead_in_of_a_run_that_is_shorter():
@@ -151,9 +172,9 @@ def test_lead_in_of_a_run_that_is_shorter():
 def test_recordings_that_don_t_tell_are_refused(tmp_path, model, rate_hz, made, message):
     path = record(tmp_path / "run.mcap", COMMAND, **made)
     with pytest.raises(DataError, match=message):
-        initial_state_after(path, model, rate_hz, LATER_S)
+        state_after(path, model, rate_hz)
     with pytest.raises(DataError, match="no such file"):
-        initial_state_after(tmp_path / "absent.mcap", model, rate_hz, LATER_S)
+        state_after(tmp_path / "absent.mcap", model, rate_hz)
 
 
 AT = datetime(2026, 1, 1, tzinfo=UTC)
