@@ -159,7 +159,7 @@ class ReversalCurves:
 
     turns: tuple[float, ...]  # commands of the turning points, the highest first
     curves: tuple[F64, ...]  # command and displacement from the turn to the top, float64[2, n]
-    return_um: float  # rms difference at the top between curves
+    return_um: float  # rms difference at the top between curves; nan if no sample is near it
     return_percent: float  # the same, of the span of the curves
 
 
@@ -174,7 +174,8 @@ def reversal_curves(recording: Recording) -> ReversalCurves:
     pairs = list(zip(edges[1::2].tolist(), edges[2::2].tolist(), strict=False))
     curves = [np.array((command[a : b + 1], displacement_um[a : b + 1])) for a, b in pairs]
     top, span = float(command.max()), float(np.ptp(command))
-    ends = [float(np.nanmean(c[1][c[0] > top - _NEAR_TOP * span])) for c in curves]
+    near_top = [c[1][c[0] > top - _NEAR_TOP * span] for c in curves]
+    ends = [np.nanmean(each) if each.size else math.nan for each in near_top]
     span_um = max(float(np.nanmax(displacement_um) - np.nanmin(displacement_um)), 1e-12)
     spread_um = float(np.std(ends))
     return ReversalCurves(

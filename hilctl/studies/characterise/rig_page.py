@@ -1,5 +1,6 @@
 """Page and figures of a characterisation, as one self-contained HTML file."""
 
+import math
 from collections.abc import Iterator, Sequence
 from functools import partial
 from itertools import cycle
@@ -169,7 +170,7 @@ def _measured_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
         largest = measured.growing[-1]
         low_high = f"{significant(largest.low_um, 4)} to {significant(largest.high_um, 4)} µm"
         yield "largest amplitude", f"{largest.amplitude:.4g} {unit}, {low_high}"
-    if (curves := measured.reversal) is not None:
+    if (curves := measured.reversal) is not None and not math.isnan(curves.return_percent):
         return_um = quantity(curves.return_um, "um", 2)
         yield "return-point error", f"{return_um}, {curves.return_percent:.2g} %"
     if measured.crept_percent:

@@ -237,7 +237,9 @@ def _take_fast(recording: Recording, limits: Limits, measured: Measured) -> Eval
 
 def _take_reversal(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     found = reversal_curves(recording)
-    text = f"{len(found.turns)} curves return to {found.return_percent:.2g} % of their span"
+    text = f"{len(found.turns)} curves"
+    if not math.isnan(found.return_percent):
+        text += f" return to {found.return_percent:.2g} % of their span"
     return replace(measured, reversal=found), text
 
 

@@ -1,5 +1,6 @@
 """Metrics of loops and reversal curves, repeatability, growth of amplitudes."""
 
+import math
 from dataclasses import replace
 
 import numpy as np
@@ -128,3 +129,10 @@ def test_reversal_curves_return_to_one_point(limits, played):
         limits, reversal_keys(limits, 3.0), lambda v: plays(v) + 4.0 * np.arange(v.size) / v.size
     )
     assert reversal_curves(creeping).return_percent > 1.0
+
+
+def test_coarse_samples_show_no_return_point(limits_with, played):
+    slow = limits_with("sample_rate_hz=20", "block=1", "limits.slew_a_per_s=15.0")
+    found = reversal_curves(played(slow, reversal_keys(slow, 3.0), plays))
+    assert len(found.curves) == 10
+    assert math.isnan(found.return_percent)
