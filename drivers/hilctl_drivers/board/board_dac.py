@@ -262,7 +262,8 @@ class BoardStream(BoardDac):
             raise DeviceError(
                 f"underrun: the FIFO of the board was empty for {found.underruns} sample periods, "
                 f"about sample {max(0, played)}; its FIFO kept {self._latency_blocks} blocks of "
-                f"{self._samples}: this machine or the line was slower than that"
+                f"{self._samples}: this machine or the line was slower than that; raise "
+                "device.fifo_blocks"
             )
         answered = first_sample - self._latency_blocks * self._samples
         want = self._samples if answered >= 0 else 0

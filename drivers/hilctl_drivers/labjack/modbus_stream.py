@@ -185,7 +185,8 @@ class StreamSession:
         level = self._queued - self._fetched - self._backlog
         self.level_min = min(self.level_min, level)
         if level < self.margin:
-            raise DeviceError(f"underrun: {_shortage(level)}, at sample {self._queued}")
+            where = f"at sample {self._queued}; raise device.fifo_blocks"
+            raise DeviceError(f"underrun: {_shortage(level)}, {where}")
         if abs(held - level) > self.margin:
             raise DeviceError(
                 f"the device holds {held} values, by its scans it must be {level}: it repeated "
