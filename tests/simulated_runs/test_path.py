@@ -6,6 +6,7 @@ from hilctl import api
 from hilctl.analysis.report import summarize
 from hilctl.recording.reader import read
 from hilctl_drivers.simulated.devices import PiezoStage
+from tests.simulated_runs.test_wires import BOARD, Wire, emulated
 
 STAGE = f"device.stage={PiezoStage.fitted(-100.0, 100.0, 38.0).model_dump_json()}"
 QUICK = ("sample_rate_hz=1000", "block=10")
@@ -24,19 +25,19 @@ MORE_RIGS = {
 }
 
 
-def follow(folder, device, settings, within_percent):
+def follow(folder, device, settings, within_percent, *, fast=True):
     rig, model, learned = (folder / f"{name}.yaml" for name in ("rig", "model", "learned"))
     api.init(device, rig, settings=settings)
     assert api.check(rig).warnings == ()
-    found = api.characterise(rig, model, fast=True)
+    found = api.characterise(rig, model, fast=fast)
     assert (found.problem, found.verdict.grade) == ("", "good")
     assert found.held_out[0].peak_percent < within_percent
     assert api.check(rig, found.first_run).warnings == ()
-    run = api.run(rig, folder / "run.mcap", settings=found.first_run, fast=True)
+    run = api.run(rig, folder / "run.mcap", settings=found.first_run, fast=fast)
     assert run.code == "completed"
     before = summarize(read(run.path)).peak_error_percent
     assert before < 2.0
-    result = api.learn(rig, learned, settings=found.first_run, fast=True)
+    result = api.learn(rig, learned, settings=found.first_run, fast=fast)
     assert learned.is_file()
     assert result.check[0].error_percent < before
 
@@ -50,3 +51,21 @@ def test_a_simulated_rig_is_compensated_by_default(tmp_path, device, settings, p
 @pytest.mark.parametrize(("device", "settings", "percent"), MORE_RIGS.values(), ids=MORE_RIGS)
 def test_so_are_the_others(tmp_path, device, settings, percent):
     follow(tmp_path, device, (*settings, *QUICK), percent)
+
+
+PATIENT = (
+    "device.fifo_blocks=60",
+    "device.timeout_s=2.0",
+    "device.watchdog.timeout_s=20.0",
+    "timing.max_late_s=5.0",
+    "timing.hang_s=5.0",
+)
+"""Settings that survive the stalls of a busy machine."""
+
+
+@pytest.mark.long
+@pytest.mark.timeout(900)
+def test_so_is_an_emulated_board(tmp_path):
+    with emulated(Wire("cobs_board_fifo", BOARD, 10_000.0), tmp_path) as device:
+        at = f"device.serial_port={device['serial_port']}"
+        follow(tmp_path, "cobs_board_fifo", (at, *PATIENT), 1.2, fast=False)
