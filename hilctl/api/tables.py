@@ -30,6 +30,8 @@ _SHOWN = {
     "path": "recording",
 }
 """Columns of the table, and their headings."""
+_ON_LINES = ("waveform", "code", "peak_error_percent", LABELS_FACT, "path")
+"""Columns that fit on a line; the default file name contains name and start of a run."""
 _NUMBERS = {"duration_s", "peak_hysteresis_percent", "peak_error_percent", "skipped_ticks"}
 _TO_SECONDS = len("2000-01-01T00:00:00")
 _MOST_ROWS = 30
@@ -121,9 +123,10 @@ class RunTable(list[Entry]):
 
     def lines(self) -> list[str]:
         """Return headings and recordings as aligned lines."""
+        labelled = any(entry[LABELS_FACT] for entry in self)
+        shown = [name for name in _ON_LINES if labelled or name != LABELS_FACT]
         columns = [
-            _padded(name, [heading, *(_cell(name, entry) for entry in self)])
-            for name, heading in _SHOWN.items()
+            _padded(name, [_SHOWN[name], *(_cell(name, entry) for entry in self)]) for name in shown
         ]
         return ["  ".join(cells) for cells in zip(*columns, strict=True)]
 

@@ -4,8 +4,9 @@ import json
 import shlex
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Hashable, Sequence
 from dataclasses import asdict, replace
+from functools import partial
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -44,6 +45,12 @@ from hilctl.studies.campaign.steps import (
 )
 from hilctl.studies.campaign.table import CampaignRow
 from hilctl.studies.multi_run.collect import COMPLETED
+from hilctl.studies.multi_run.varied_parameter import (
+    VariedParameter,
+    dimensions,
+    short_value,
+    texts_of,
+)
 
 _RESUMES = "the same command resumes from there"
 Folder = Annotated[
@@ -126,15 +133,17 @@ def _run_campaign(
     dry_run: bool,
     as_json: bool,
 ) -> None:
+    varied = varied_by(steps)
+
     def on_plan(plan: CampaignPlan) -> None:
         if not as_json:
-            print_plan(plan, fast=fast, every_step=dry_run)
+            print_plan(plan, varied, fast=fast, every_step=dry_run)
         elif dry_run:
             print_json(plan_mapping(plan))
 
     with progress_bar("campaign", quiet=as_json) as on_progress:
         host = CampaignHost(on_progress=on_progress, on_note=_note)
-        host = host if as_json else replace(host, on_row=print_row)
+        host = host if as_json else replace(host, on_row=partial(print_row, varied))
         try:
             result = run_steps(
                 steps, folder, host,
@@ -188,10 +197,21 @@ def plan_mapping(plan: CampaignPlan) -> dict[str, Any]:
     }
 
 
-def print_plan(plan: CampaignPlan, *, fast: bool, every_step: bool) -> None:
+def varied_by(steps: CampaignSteps) -> tuple[VariedParameter, ...]:
+    """Return the varied parameters of a campaign, without those that depend on others."""
+    return dimensions(steps.keys, [_values(step) for step in steps.steps])
+
+
+def _values(step: CampaignStep) -> dict[str, Hashable]:
+    return {key: short_value(value) for key, value in step.point.items()}
+
+
+def print_plan(
+    plan: CampaignPlan, varied: Sequence[VariedParameter], *, fast: bool, every_step: bool
+) -> None:
     """Print the plan of a campaign, with all of its steps if ``every_step`` is set."""
     if every_step:
-        print_rich(_steps(plan))
+        print_rich(_steps(plan, varied))
     kept = len(plan.steps) - len(plan.left)
     done = f", {kept} done earlier" if kept else ""
     time = f"{_duration(plan.seconds)} of rig time"
@@ -202,11 +222,11 @@ def print_plan(plan: CampaignPlan, *, fast: bool, every_step: bool) -> None:
     print(f"{count}; {time}{pauses}{how}; {disk}")
 
 
-def _steps(plan: CampaignPlan) -> Table:
+def _steps(plan: CampaignPlan, varied: Sequence[VariedParameter]) -> Table:
     rows = [
         (
             str(each.step.number),
-            *(_shown(each.step.point.get(key)) for key in plan.campaign.keys),
+            *(_shown(_values(each.step).get(parameter.key)) for parameter in varied),
             f"{each.seconds:.1f}" if each.kept is None else "",
             f"{each.pause_s:.0f}" if each.pause_s else "",
             f"{each.heat_a2**0.5:.2f}" if each.kept is None else "",
@@ -214,8 +234,9 @@ def _steps(plan: CampaignPlan) -> Table:
         )
         for each in plan.steps
     ]
-    headings = ("step", *plan.campaign.keys, "s", "pause s", "coil A rms", "")
-    return table(f"{plan.campaign.config.name}: steps", headings, rows)
+    axes = (parameter.axis for parameter in varied)
+    headings = ("step", *axes, "s", "pause s", "coil A rms", "")
+    return table(f"{plan.campaign.config.name}: steps", headings, rows, wrap=True)
 
 
 def _shown(value: Any) -> str:
@@ -231,20 +252,23 @@ def _duration(seconds: float) -> str:
     return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
 
 
-def print_row(step: CampaignStep, row: CampaignRow) -> None:
+def print_row(varied: Sequence[VariedParameter], step: CampaignStep, row: CampaignRow) -> None:
     """Print a completed step."""
-    values = "  ".join(f"{key}={_shown(value)}" for key, value in step.point.items())
+    values = "reference run" if step.is_reference else texts_of(varied, _values(step))
     figures, text = row.figures, row.result
     if row.code == COMPLETED:
         parts = [
             (figures.peak_to_peak_um, "{:.4g} µm"),
-            (figures.peak_hysteresis_percent, "hysteresis {:.3g} %"),
+            (figures.peak_hysteresis_percent, "hyst. {:.3g} %"),
             (figures.peak_error_percent, "error {:.3g} %"),
             (figures.natural_hz, "resonance {:.4g} Hz"),
         ]
         text = "  ".join(form.format(value) for value, form in parts if value is not None)
     kept = "done earlier  " if row.kept else ""
-    print(f"{step.number:4d}  {values or 'reference run'}  {kept}{text}", flush=True)
+    print(
+        f"{step.number:4d}  {values}  {kept}{text}",
+        flush=True,
+    )
 
 
 def result_mapping(result: CampaignResult) -> dict[str, Any]:

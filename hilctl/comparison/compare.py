@@ -296,7 +296,7 @@ def headings(comparison: Comparison) -> list[str]:
     """Return the names of the columns."""
     trials = max((row.trials for row in comparison.rows), key=len, default=())
     names = [f"{trial.frequency_hz:.4g} Hz" for trial in trials]
-    return ["model", "par.", "fit s", "ns", "peak %", "rms %", *names]
+    return ["model", "par.", "fit s", "ns", "peak %", *names]
 
 
 def table_rows(comparison: Comparison) -> Iterator[list[str]]:
@@ -308,7 +308,6 @@ def table_rows(comparison: Comparison) -> Iterator[list[str]]:
             "-" if row.identify_s is None else f"{row.identify_s:.2f}",
             f"{row.inverse_ns:.0f}",
             f"{row.error.peak_percent:.2f}",
-            f"{row.error.rms_percent:.2f}",
         ]
         yield [*figures, *(_trial_text(trial) for trial in row.trials)]
 
@@ -323,7 +322,7 @@ def notes(comparison: Comparison) -> list[str]:
     """Return the notes of the table."""
     found = [
         "par.: identified parameters; fit s: duration; ns: inverse per sample",
-        "peak, rms %: model error on all loops, in percent of the largest peak-to-peak",
+        "peak %: model error on all loops, in percent of the largest peak-to-peak",
     ]
     if not comparison.device:
         return [*found, "compensated errors: not available, because the device is not simulated"]

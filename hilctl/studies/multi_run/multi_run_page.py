@@ -30,7 +30,8 @@ from hilctl.studies.multi_run.varied_parameter import texts_of
 
 MOST_ROWS = 1000  # most rows of the table on a page
 
-_COLUMNS = (STROKE, HYSTERESIS, AREA, PEAK_ERROR, RMS_ERROR, MODEL_ERROR, NATURAL, DAMPING)
+_SHORT_COLUMNS = (STROKE, HYSTERESIS, AREA, PEAK_ERROR, NATURAL, DAMPING)
+_COLUMNS = (*_SHORT_COLUMNS[:4], RMS_ERROR, MODEL_ERROR, NATURAL, DAMPING)
 
 
 def write_series(series: RunSeries, path: Path) -> None:
@@ -73,7 +74,8 @@ def run_table(
     series: RunSeries, most: int, *, short: bool = False
 ) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows of a table without empty columns; a short one fits a terminal."""
-    figures = [each for each in _COLUMNS if each.of(series.runs)]
+    columns = _SHORT_COLUMNS if short else _COLUMNS
+    figures = [each for each in columns if each.of(series.runs)]
     headings = ["run", *(each.axis for each in series.dimensions)]
     headings += [each.short if short else axis_name(series, each) for each in figures]
     last = _last(series, short=short)

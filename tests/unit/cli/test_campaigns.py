@@ -16,6 +16,7 @@ from hilctl.studies.campaign.plan import planned
 from hilctl.studies.campaign.steps import CampaignStep, load_campaign
 from hilctl.studies.campaign.table import CampaignRow
 from hilctl.studies.multi_run.digest import RunFigures
+from hilctl.studies.multi_run.varied_parameter import dimensions
 from tests.unit.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 
 pytestmark = pytest.mark.usefixtures("undrawn")
@@ -33,7 +34,7 @@ def test_campaign_prints_steps_and_table(hilctl, words, tmp_path):
     code, shown, _ = hilctl(*words, "--fast")
     assert code == 0
     table = tmp_path / "runs" / "few.csv"
-    step = "waveform.amplitude=2  waveform.frequency_hz=20"
+    step = "20 Hz, 2"
     for text in ("4 steps", step, "few: 4 completed", f"table: {table}"):
         assert text in shown
     assert "4 done earlier" in hilctl(*words, "--fast")[1]
@@ -113,10 +114,11 @@ def test_notes_are_printed_to_standard_error(capsys):
 def test_row_prints_metrics_or_fault(capsys):
     step = CampaignStep(7, {"waveform.amplitude": 2.5}, 1, False, ())
     figures = RunFigures(peak_to_peak_um=12.345, natural_hz=300.0)
-    print_row(step, CampaignRow("completed", figures, "a.mcap", "completed", kept=True))
-    print_row(step, CampaignRow("fault: late", code="fault"))
+    varied = dimensions(["waveform.amplitude"], [step.point, {"waveform.amplitude": 5.0}])
+    print_row(varied, step, CampaignRow("completed", figures, "a.mcap", "completed", kept=True))
+    print_row(varied, step, CampaignRow("fault: late", code="fault"))
     first, second = capsys.readouterr().out.splitlines()
-    for text in ("7", "waveform.amplitude=2.5", "12.35 µm", "300 Hz"):
+    for text in ("7", "2.5", "12.35 µm", "300 Hz"):
         assert text in first
     assert second.endswith("fault: late")
 
