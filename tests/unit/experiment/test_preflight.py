@@ -146,6 +146,10 @@ class TestReference:
         assert found.hint.startswith(hint)
         checked(DISPLACEMENT, *settings, "waveform.amplitude=9.5", model=model)
 
+    def test_the_range_of_a_model_has_its_error(self):
+        model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 9.99)})
+        checked(DISPLACEMENT, "waveform.soft_start_s=0.0", model=model)
+
     def test_outside_both(self):
         model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 12.0)})
         found = refusals(DISPLACEMENT, "waveform.amplitude=80.0", model=model)
