@@ -15,7 +15,7 @@ Rates over barriers in a distribution of domains: R. C. Smith, A. G. Hatch, B. M
 "A homogenized energy model for hysteresis in ferroelectric materials: general density formulation",
 J. Intell. Mater. Syst. Struct. 16 (2005) 713. Creep of 1 to 2 % per decade of time: H. Jung and
 D.-G. Gweon, "Creep characteristics of piezoelectric actuators", Rev. Sci. Instrum. 71 (2000) 1896.
-The constants are not those of a product; the hysteresis of 10 to 20 % is that of PZT stacks.
+The constants are not those of a product; hysteresis of 5 to 15 % is that of PZT stacks.
 """
 
 import math
@@ -38,15 +38,17 @@ class SwitchingParameters:
     amplifier_bandwidth_hz: float = 5e3  # corner of the first-order amplifier
     slope_um_per_v: float = 0.15  # s, displacement without switching
     switched_um: float = 15.0  # displacement when all domains have switched
-    thermal_v: float = 0.8  # T
-    attempts_per_s: float = 0.1  # r, rate of switching at the barrier
-    barrier_mean_v: float = 8.0  # of the exponential distribution of c
-    barrier_max_v: float = 45.0  # where it is cut off
-    barriers: int = 8  # values of c
+    thermal_v: float = 1.0  # T
+    attempts_per_s: float = 1e5  # r, rate of switching at the barrier
+    barrier_mean_v: float = 30.0  # of the exponential distribution of c
+    barrier_max_v: float = 43.2  # where it is cut off
+    barriers: int = 12  # values of c
     bias_mean_v: float = 45.0  # of the normal distribution of m
     bias_std_v: float = 40.0  # its standard deviation
-    bias_range_v: tuple[float, float] = (-40.0, 140.0)  # where it is cut off
-    biases: int = 90  # values of m for each c; together a multiple of four
+    bias_range_v: tuple[float, float] = (-30.0, 130.8)  # where it is cut off
+    # Values of m for each c. Two thirds of the distance of the barriers interleave the thresholds
+    # m + c. Together a multiple of four.
+    biases: int = 67
     # Natural frequency in Hz, damping ratio and share of the static displacement.
     modes: tuple[tuple[float, float, float], ...] = ((1450.0, 0.03, 0.96), (3600.0, 0.02, 0.04))
     dac_codes: int = 65535  # codes above 0 V

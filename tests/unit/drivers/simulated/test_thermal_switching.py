@@ -34,22 +34,22 @@ def test_loops_widen_with_the_logarithm_of_the_rate():
     loops = [cycles(0.0, 100.0, hz, 2) for hz in (0.01, 0.1, 1.0, 10.0)]
     widths = [hysteresis_percent(drive_v[-1], um[-1]) for drive_v, um in loops]
     steps = np.diff(widths)
-    assert 9.0 <= widths[0] <= 15.0
+    assert 7.0 <= widths[0] <= 12.0
     assert steps == pytest.approx(steps.mean(), rel=0.15)
     assert 1.0 <= steps.mean() <= 3.0
 
 
 @pytest.mark.parametrize(("before_v", "sign"), [(0.0, 1.0), (100.0, -1.0)])
 def test_a_held_drive_creeps_with_the_logarithm_of_time(before_v, sign):
-    """Onwards, by 1 to 4 % of the last motion per decade from 0.1 s."""
+    """Onwards, by 1 to 2 % of the last motion per decade from 0.1 s."""
     rate_hz = 1000.0
     ramps = np.concatenate((np.linspace(0.0, before_v, 30), np.linspace(before_v, 60.0, 30)))
     plant = QUICK.plant(rate_hz, 1)
     turn_um, held_um = run(plant, ramps)[30], run(plant, np.full(101_000, 60.0))
     at = held_um[[100, 1000, 10_000, 100_000]]
     steps = sign * np.diff(at) / abs(at[0] - turn_um)
-    assert steps == pytest.approx(steps.mean(), rel=0.1)
-    assert 0.01 <= steps.mean() <= 0.04
+    assert steps == pytest.approx(steps.mean(), rel=0.15)
+    assert 0.01 <= steps.mean() <= 0.02
 
 
 def test_a_loop_closes_and_its_remanence_decays():
@@ -100,7 +100,7 @@ def test_options():
     """Rest reads 0, details hold the constants, and a stage is refused."""
     device = SimulatedPiezo(PiezoOptions(physics="thermal_switching", noise=False))
     assert not run(device.plant(1e3), np.zeros(500)).any()
-    assert device.info.details["thermal_v"] == "0.8"
+    assert device.info.details["thermal_v"] == "1.0"
     stage = {
         "drive_max_v": 1.0,
         "slope_um_per_v": 1.0,
