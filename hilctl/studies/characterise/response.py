@@ -86,12 +86,12 @@ def rest_noise(recording: Recording) -> RestNoise:
 
 
 def crept_percent(recording: Recording) -> tuple[float, ...]:
-    """Return the creep from 0.1 s on in each long hold off the initial command, in percent."""
+    """Return the creep from 0.1 s on in each long hold, in percent of the motion to it."""
     segment = recording.segments[-1]
     samples = recording.samples.part(segment.start, segment.stop)
     command, part = samples.command, round(_MEAN_S * recording.sample_rate_hz)
     began = float(recording.samples.command[0])
-    began_um = float(np.nanmean(recording.samples.displacement_um[:part]))
+    before_um = float(np.nanmean(recording.samples.displacement_um[:part]))
     turns = np.flatnonzero(np.diff(command))
     edges = np.concatenate(([0], turns + 1, [command.size]))
     crept = []
@@ -101,7 +101,8 @@ def crept_percent(recording: Recording) -> tuple[float, ...]:
         moving_um = samples.displacement_um[start:stop]
         first_um = float(np.nanmean(moving_um[part : 2 * part]))
         last_um = float(np.nanmean(moving_um[-part:]))
-        crept.append(100.0 * (last_um - first_um) / (first_um - began_um))
+        crept.append(100.0 * (last_um - first_um) / (first_um - before_um))
+        before_um = last_um
     return tuple(crept)
 
 

@@ -39,7 +39,7 @@ class Measured:
     fast: tuple[LoopFigures, ...] = ()  # loops at several frequencies
     reversal: ReversalCurves | None = None
     biased: tuple[LoopFigures, ...] = ()  # small loops over the whole range
-    crept_percent: tuple[float, ...] = ()  # creep in each hold, of the displacement
+    crept_percent: tuple[float, ...] = ()  # creep in each hold, of the motion to it
     repeated: Repeatability | None = None  # change of the largest growing loop at the end
 
     def to_mapping(self) -> dict[str, Any]:
