@@ -22,7 +22,7 @@ import numpy as np
 
 from hilctl import api
 from hilctl.base.types import F64
-from hilctl.experiment.device_state import begin
+from hilctl.experiment.device_state import begin, rests_at
 from hilctl.experiment.load import load_experiment
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
@@ -30,7 +30,7 @@ from hilctl.models.model_file import load_model
 from hilctl.signals.cycle_metrics import expected_maximum
 from hilctl_drivers.simulated.actuator_base import Plant
 from hilctl_drivers.simulated.devices import PHYSICS, SimulatedDevice
-from tests.benchmark.references import GOALS, RATE_HZ, Row, references
+from tests.benchmark.references import GOALS, RATE_HZ, Row, Stroke, references
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RIGS = {physics: ("terfenol_sine_6a.yaml", f"device.physics={physics}") for physics in PHYSICS} | {
@@ -124,7 +124,8 @@ class Rig:
         assert self.model.output_range_um is not None
         low_um, high_um = self.model.output_range_um
         margin_um = MARGIN * (high_um - low_um)
-        return references(low_um + margin_um, high_um - margin_um)
+        rest_um = rests_at(self.model, RATE_HZ, 0.0)
+        return references(Stroke(low_um + margin_um, high_um - margin_um, rest_um))
 
     def result(self, row: Row) -> Result:
         """Return the error on a reference."""

@@ -35,7 +35,7 @@ class Row:
 
     Attributes:
         group: Its class, a key of ``GOALS``.
-        reference_um: float64[n], from 0.
+        reference_um: float64[n], from rest.
         judged: bool[n], the evaluated samples.
     """
 
@@ -47,10 +47,11 @@ class Row:
 
 @dataclass(frozen=True, slots=True)
 class Stroke:
-    """Range of references, in um."""
+    """Range of references and displacement at rest, in um."""
 
     low_um: float
     high_um: float
+    rest_um: float
 
     def row(
         self, group: str, detail: str, wave: F64, begin_s: float = _SWELL_S, *, place: float = 0.0
@@ -62,12 +63,12 @@ class Stroke:
         swelling = 0.5 - 0.5 * np.cos(np.pi * np.clip(time_s / begin_s, 0.0, 1.0))
         judged = np.zeros(wave.size, dtype=np.bool_)
         judged[round(begin_s * RATE_HZ) : -_UNJUDGED] = True
-        return Row(group, f"{group}, {detail}", swelling * (middle_um + half_um * wave), judged)
+        reference_um = self.rest_um + swelling * (middle_um - self.rest_um + half_um * wave)
+        return Row(group, f"{group}, {detail}", reference_um, judged)
 
 
-def references(low_um: float, high_um: float) -> Iterator[Row]:
+def references(stroke: Stroke) -> Iterator[Row]:
     """Yield all rows within a stroke."""
-    stroke = Stroke(low_um, high_um)
     for part in (1.0, 0.5, 0.25, 0.1):
         places = {"": 0.0, " low": part - 1.0, " high": 1.0 - part} if part < 1.0 else {"": 0.0}
         for label, place in places.items():
