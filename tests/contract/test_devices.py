@@ -107,6 +107,7 @@ CASES = [
     *SIMULATED,
     *OTHERS,
     *(f"simulated_terfenol {words}" for words in PHYSICS),
+    "simulated_piezo thermal_switching",
     *(f"modbus_dac {words}" for words in (*MODBUS, *PIEZO)),
 ]
 
