@@ -146,11 +146,11 @@ def print_step(row: StepRow) -> None:
 def print_characterisation(result: Characterisation, model: Path | None, page: Path) -> None:
     """Print the validation error, the measured values and the files."""
     if result.held_out:
-        title = "validation errors (references that were not fitted)"
-        print_rich(table(title, HELD_OUT_HEADINGS, held_out_rows(result)))
         print(f"verdict: {result.verdict}")
         for note in result.verdict.notes if result.verdict else ():
             print(note)
+        title = "validation errors (references that were not fitted)"
+        print_rich(table(title, HELD_OUT_HEADINGS, held_out_rows(result)))
     if figures := list(figure_rows(result)):
         print_rich(table("measured", ("quantity", "value"), figures, left={"value"}))
     if model is not None:

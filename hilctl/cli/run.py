@@ -9,6 +9,7 @@ import sys
 import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -144,7 +145,11 @@ def _detach(
 def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Check an experiment and show what it would do (nothing moves)."""
     checked = api.check(experiment, settings or [])
-    forecast = {"warnings": list(checked.warnings), **checked.forecast.to_mapping()}
+    forecast = {
+        "warnings": list(checked.warnings),
+        "expected_error": asdict(checked.expected) if checked.expected else None,
+        **checked.forecast.to_mapping(),
+    }
     values = {"experiment": str(experiment), **forecast}
     print_result(values, lambda: print_forecast(checked), as_json=as_json)
 
@@ -278,6 +283,10 @@ def print_forecast(checked: CheckedExperiment) -> None:
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
         "recording": _recording(forecast.recording_mb),
     }
+    if (expected := checked.expected) is not None:
+        rows["model error"] = (
+            f"up to {expected.percent:.2g} % of a motion's peak-to-peak at {expected.stroke}"
+        )
     if forecast.begins:
         rows["initial state"] = forecast.begins
     interlocks = config.interlocks

@@ -1,13 +1,13 @@
 """Comparison of a reference with the motions that the model was identified on."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 
 import numpy as np
 
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, chunks
-from hilctl.models.base import IdentifiedRange
+from hilctl.models.base import SMALLEST_STROKE, IdentifiedRange, Provenance, stroke_class
 from hilctl.waveforms.build import Reference
 from hilctl.waveforms.shapes import LONG, telling_samples
 
@@ -35,11 +35,20 @@ class Spectrum:
 
 
 @dataclass(frozen=True, slots=True)
+class ExpectedError:
+    """Largest error of the model that is expected on a reference."""
+
+    stroke: str  # class of its smallest motion, see :data:`hilctl.models.base.STROKES`
+    percent: float  # of the peak-to-peak of that motion
+
+
+@dataclass(frozen=True, slots=True)
 class RangeFindings:
-    """Deviations of a reference from the motions a model was identified on."""
+    """Comparison of a reference with the motions a model was identified on."""
 
     refused: tuple[str, ...] = ()  # reasons to reject the run
     warnings: tuple[str, ...] = ()  # reasons why the model error is unknown
+    expected: ExpectedError | None = None  # None if it is unknown
 
 
 def spectrum(
@@ -90,8 +99,9 @@ UNKNOWN = (
 )
 
 
-def range_findings(known: IdentifiedRange | None, reference: Reference) -> RangeFindings:
+def range_findings(provenance: Provenance, reference: Reference) -> RangeFindings:
     """Compare a reference in um with the motions a model was identified on."""
+    known = provenance.identified_range
     if known is None:
         return RangeFindings(warnings=(UNKNOWN,))
     rate_hz, told = reference.sample_rate_hz, reference.telling
@@ -110,13 +120,22 @@ def range_findings(known: IdentifiedRange | None, reference: Reference) -> Range
             f"the reference has frequencies up to about {found.highest_hz:.3g} Hz; the model was "
             f"identified on {_span(low_hz, high_hz)} Hz"
         )
-    return RangeFindings(warnings=tuple(warnings))
+    if warnings:
+        return RangeFindings(warnings=tuple(warnings))
+    return RangeFindings(expected=_expected(known, provenance.errors_by_stroke, reference))
+
+
+def _expected(
+    known: IdentifiedRange, errors: Mapping[str, float], reference: Reference
+) -> ExpectedError | None:
+    part = min(_moves_um(reference), default=0.0) / known.peak_to_peak_um[1]
+    stroke = stroke_class(part) if part >= SMALLEST_STROKE else ""
+    return ExpectedError(stroke, errors[stroke]) if stroke in errors else None
 
 
 def _motion_warnings(known: IdentifiedRange, reference: Reference) -> Iterator[str]:
-    values, segments = reference.values, reference.segments
-    sample_rate_hz = reference.sample_rate_hz
-    moves = [move for each in segments if (move := _move_um(values, each)) > 0.0]
+    segments, sample_rate_hz = reference.segments, reference.sample_rate_hz
+    moves = _moves_um(reference)
     smallest_um = known.peak_to_peak_um[0]
     if moves and min(moves) < SMALL * smallest_um:
         yield (
@@ -135,6 +154,12 @@ def _motion_warnings(known: IdentifiedRange, reference: Reference) -> Iterator[s
             f"the reference moves at up to {speed:.3g} µm/s; the model was identified at up to "
             f"{known.speed_um_per_s:.3g} µm/s"
         )
+
+
+def _moves_um(reference: Reference) -> list[float]:
+    """Return the motion of each segment that moves."""
+    moves = (_move_um(reference.values, each) for each in reference.segments)
+    return [move for move in moves if move > 0.0]
 
 
 def _move_um(values: F64, segment: Segment) -> float:

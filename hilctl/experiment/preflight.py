@@ -39,7 +39,7 @@ from hilctl.experiment.device_state import (
 )
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.experiment.model_validity import RangeFindings, range_findings
+from hilctl.experiment.model_validity import ExpectedError, RangeFindings, range_findings
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.lead_in import Conditioning
 from hilctl.waveforms.build import Reference, build
@@ -62,6 +62,7 @@ class CheckedExperiment:
         warnings: Reasons why the run may be less accurate or less punctual than expected.
         heat_a2: Heat of the coil before it, the running mean square of its current in A^2.
         operator: Subject of the adaptation; None without adaptation.
+        expected: Expected error of the model; None without a model, or if it is unknown.
     """
 
     loaded: LoadedExperiment
@@ -71,6 +72,7 @@ class CheckedExperiment:
     warnings: tuple[str, ...]
     heat_a2: float
     operator: DisplacementOperator | None = None
+    expected: ExpectedError | None = None
 
     @property
     def state_size(self) -> int:
@@ -115,7 +117,7 @@ def check(
     _warn_of_long_work(reference)
     findings = RangeFindings()
     if loaded.model is not None and reference.unit == "um":
-        findings = range_findings(loaded.model.provenance.identified_range, reference)
+        findings = range_findings(loaded.model.provenance, reference)
     problems += reference_problems(loaded, reference.unit, *reference.span)
     hint = "identify the model on such motions, or keep the waveform within those it was fitted on"
     problems += [loaded.problem("waveform", text, hint=hint) for text in findings.refused]
@@ -140,7 +142,9 @@ def check(
         if found := command_problems(loaded, worst, reference):
             raise ConfigError([at_worst(each) for each in found])
     warnings += (*pace_warnings(config, loaded.device.info), *_clamped(loaded, forecast))
-    return CheckedExperiment(loaded, reference, forecast, begun, warnings, heat_a2, operator)
+    return CheckedExperiment(
+        loaded, reference, forecast, begun, warnings, heat_a2, operator, findings.expected
+    )
 
 
 def _warn_of_long_work(reference: Reference) -> None:

@@ -1,21 +1,25 @@
-"""Errors of a model of any kind on records."""
+"""Errors of a model of any kind on records, and on motions of each class of strokes."""
 
+import math
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from typing import Any, Literal
+from itertools import pairwise, starmap
+from typing import Any, Literal, NamedTuple
 
 import numpy as np
 from scipy.interpolate import CubicSpline
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64
-from hilctl.identify.data.records import Record, Records, SteadyLoop
+from hilctl.base.types import F64, I64
+from hilctl.identify.data.records import History, Record, Records, SteadyLoop, turning_points
 from hilctl.identify.fit_api import PERIODS, FitData
 from hilctl.identify.parallel import parallel_map
 from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.objective import response_um
-from hilctl.models.base import HysteresisModel
+from hilctl.models.base import SMALLEST_STROKE, STROKES, HysteresisModel, stroke_class
 from hilctl.models.plays import PlayModel
 from hilctl.models.staged import StagedModel
+from hilctl.signals import cycle_metrics
 from hilctl.signals.cycle_metrics import loop_area, peak_hysteresis_percent
 
 
@@ -30,6 +34,20 @@ class LoopScore:
     peak_to_peak_um: float
 
 
+@dataclass(frozen=True, slots=True)
+class StrokeError:
+    """Error of a model on motions of one class of strokes, each in percent of its own peak-to-peak.
+
+    Long records are cut into motions. The error of a record is that of 95 % of its motions, and
+    that of the class is the largest of a record.
+    """
+
+    label: str  # class, see :data:`hilctl.models.base.STROKES`
+    peak_percent: float
+    rms_percent: float
+    motions: int
+
+
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
     """Errors of a model on all records."""
@@ -39,6 +57,16 @@ class Evaluation:
     peak_percent: float  # largest error, of the largest peak-to-peak of a record
     rms_percent: float  # root mean square displacement error, in percent of the same
     own_peak_percent: float  # largest ``peak_percent`` of single records
+    classes: tuple[StrokeError, ...]  # of the classes that have motions, the largest first
+
+    @property
+    def stroke_percent(self) -> float:
+        """Geometric mean of the errors by stroke, so that each class counts alike."""
+        return float(
+            np.exp(
+                np.mean([math.log(max(each.rms_percent, TINY_PERCENT)) for each in self.classes])
+            )
+        )
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the errors as plain mappings, lists and numbers, for JSON."""
@@ -47,33 +75,131 @@ class Evaluation:
             "peak_percent": self.peak_percent,
             "rms_percent": self.rms_percent,
             "own_peak_percent": self.own_peak_percent,
+            "classes": [asdict(each) for each in self.classes],
         }
 
 
-def judge(model: HysteresisModel, data: Records | FitData, *, creep: bool = False) -> Evaluation:
+def judge(
+    model: HysteresisModel,
+    data: Records | FitData,
+    *,
+    creep: bool = False,
+    stroke_um: float | None = None,  # that classes refer to; the largest of the records if None
+) -> Evaluation:
     """Return the errors of a model on records; loops are in their periodic steady state."""
     data = data if isinstance(data, FitData) else FitData(data)
     responses_um = _modelled_um(model, data)
     if creep:
         responses_um = data.with_creep(responses_um)
-    return judgement_of(data, responses_um)
+    return judgement_of(data, responses_um, stroke_um)
 
 
-def judgement_of(data: FitData, responses_um: F64) -> Evaluation:
+def judgement_of(data: FitData, responses_um: F64, stroke_um: float | None = None) -> Evaluation:
     """Return the errors of responses, float64[N], at the evaluated samples of the records."""
     errors_um = responses_um - data.target_um
-    errors = tuple(
-        _loop_error(record, responses_um[place], data.target_um[place])
-        for record, place in zip(data.records, data.places, strict=True)
-    )
+    modelled_um = tuple(responses_um[place] for place in data.places)
+    targets_um = [data.target_um[place] for place in data.places]
+    parts = list(zip(data.records, modelled_um, targets_um, strict=True))
+    errors = tuple(_loop_error(*part) for part in parts)
     to_percent = 100.0 / data.stroke_um
     return Evaluation(
         errors=errors,
-        modelled_um=tuple(responses_um[place] for place in data.places),
+        modelled_um=modelled_um,
         peak_percent=float(np.max(np.abs(errors_um))) * to_percent,
         rms_percent=float(np.sqrt(np.mean(errors_um**2))) * to_percent,
         own_peak_percent=max(error.peak_percent for error in errors),
+        classes=stroke_errors(
+            motions_of(
+                target_um,
+                response_um,
+                stroke_um or data.stroke_um,
+                record.command[-target_um.size :] if isinstance(record, History) else None,
+            )
+            for record, response_um, target_um in parts
+        ),
     )
+
+
+MOST_MOTIONS_PERCENT = 95.0
+TINY_PERCENT = 1e-9  # an error that is 0 has no logarithm
+FEWEST_SWINGS = 2
+_LIMITS = (math.inf, *(math.sqrt(a * b) for a, b in pairwise(STROKES.values())))
+"""Largest motion of each class, of the stroke."""
+
+
+class MotionError(NamedTuple):
+    """Errors of a motion in percent of its peak-to-peak."""
+
+    label: str  # class of its stroke
+    peak_percent: float
+    rms_percent: float
+
+
+def motions_of(
+    measured_um: F64,
+    modelled_um: F64,
+    stroke_um: float,
+    command: F64 | None = None,  # of a history; a loop is one motion
+) -> list[MotionError]:
+    """Return the motions of all classes in a record; the whole record if it has no two swings."""
+    places = set[tuple[int, int]]()
+    if command is not None:
+        turns = np.unique([0, *turning_points(command), command.size])
+        places = set(_cut(measured_um, turns, stroke_um))
+    found = []
+    for place in starmap(slice, sorted(places or {(0, measured_um.size)})):
+        error_um, span_um = modelled_um[place] - measured_um[place], np.ptp(measured_um[place])
+        label = stroke_class(float(span_um) / stroke_um)
+        # Parts of histories are as large as their class allows, but stand for all of it.
+        largest_um = STROKES[label] * stroke_um if places else math.inf
+        to_percent = 100.0 / min(float(span_um), largest_um)
+        errors_um = cycle_metrics.peak(error_um), cycle_metrics.rms(error_um)
+        found.append(MotionError(label, *(to_percent * each for each in errors_um)))
+    return found
+
+
+def _cut(measured_um: F64, turns: I64, stroke_um: float) -> Iterator[tuple[int, int]]:
+    """Yield parts from turn to turn, for each class as long as its largest motion allows."""
+    lows = np.minimum.reduceat(measured_um, turns[:-1]).tolist()
+    highs = np.maximum.reduceat(measured_um, turns[:-1]).tolist()
+    swings = [*zip(lows, highs, strict=True), (-math.inf, math.inf)]
+    least_um = SMALLEST_STROKE * stroke_um
+    for most in _LIMITS:
+        start, low, high = 0, math.inf, -math.inf
+        for swing, (lowest, highest) in enumerate(swings):
+            if swing > start and max(high, highest) - min(low, lowest) >= most * stroke_um:
+                if swing - start >= FEWEST_SWINGS and high - low > least_um:
+                    yield int(turns[start]), int(turns[swing])
+                start, low, high = swing, math.inf, -math.inf
+            low, high = min(low, lowest), max(high, highest)
+
+
+def stroke_errors(records: Iterable[Sequence[MotionError]]) -> tuple[StrokeError, ...]:
+    """Return the error of each class that has motions, see :class:`StrokeError`."""
+    by_class: dict[str, list[F64]] = {name: [] for name in STROKES}
+    for motions in records:
+        for name, found in by_class.items():
+            if own := [each[1:] for each in motions if each.label == name]:
+                found.append(np.array(own))
+    return tuple(
+        StrokeError(
+            label=name,
+            peak_percent=max(
+                float(np.percentile(own[:, 0], MOST_MOTIONS_PERCENT, method="higher"))
+                for own in found
+            ),
+            rms_percent=max(cycle_metrics.rms(own[:, 1]) for own in found),
+            motions=sum(map(len, found)),
+        )
+        for name, found in by_class.items()
+        if found
+    )
+
+
+def largest_errors(errors: Sequence[StrokeError]) -> tuple[StrokeError, ...]:
+    """Return the largest error of each class."""
+    found = {each.label: each for each in sorted(errors, key=lambda each: each.peak_percent)}
+    return tuple(found[name] for name in STROKES if name in found)
 
 
 def _modelled_um(model: HysteresisModel, data: FitData) -> F64:

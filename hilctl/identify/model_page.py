@@ -12,20 +12,23 @@ from hilctl.base.formatting import short_name
 from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import History, Record, turning_points
 from hilctl.identify.evaluation import Evaluation
+from hilctl.identify.model_quality import Verdict
 from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
 from hilctl.identify.summary import (
     CLASS_HEADINGS,
     HEADINGS,
     REFINEMENT_HEADINGS,
+    STROKE_HEADINGS,
     class_rows,
     error_rows,
     parameter_texts,
     refinement_rows,
+    stroke_rows,
     summary,
     worse_lines,
 )
-from hilctl.models.base import HysteresisModel
+from hilctl.models.base import STROKES, HysteresisModel
 from hilctl.models.model_file import dump_model
 
 MOST_RECORDS = 36
@@ -38,6 +41,7 @@ def identification_page(found: Identification) -> str:
     fit = found.fit
     unit = fit.model.input_unit
     body = _head("Identified model", fit.model, [fit.model.provenance.method, *summary(found)])
+    body += errors_by_stroke(found.verdict)
     if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on data not fitted</h2>"]
         body += [html.grid(HEADINGS, error_rows(held_out.judgement.errors))]
@@ -58,6 +62,27 @@ def _head(title: str, model: HysteresisModel, lines: Sequence[str]) -> list[str]
     """Return title, sources and results."""
     source = html.paragraph(", ".join(model.provenance.source), "file")
     return [f"<h1>{title}</h1>", source, *map(html.paragraph, lines)]
+
+
+def errors_by_stroke(verdict: Verdict) -> list[str]:
+    """Return the errors of a verdict by stroke, as a section with a table and a figure."""
+
+    def draw(axes: Axes) -> None:
+        strokes = [100.0 * STROKES[each.label] for each in verdict.classes]
+        for name, colour in (("peak", ERROR), ("rms", DISPLACEMENT)):
+            errors = [getattr(each, f"{name}_percent") for each in verdict.classes]
+            axes.loglog(strokes, errors, "o-", color=colour, label=name)
+        axes.set_xticks(strokes, [f"{stroke:g}" for stroke in strokes])
+        axes.minorticks_off()
+        axes.yaxis.set_major_formatter("{x:g}")
+        axes.set(xlabel="peak-to-peak, % of the stroke", ylabel="error, % of its peak-to-peak")
+
+    figure = FigureSpec("strokes", "Largest error by stroke.", (Panel(draw, height=0.5),))
+    return [
+        "<h2>Errors by stroke</h2>",
+        html.grid(STROKE_HEADINGS, stroke_rows(verdict)),
+        html.figures([figure]),
+    ]
 
 
 def drawn_records(

@@ -2,6 +2,7 @@
 
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
+from functools import partial
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
@@ -9,14 +10,16 @@ import numpy as np
 from hilctl.base.types import F64
 from hilctl.identify.data.data_faults import correlation, data_reasons, record_fault
 from hilctl.identify.data.records import Record, SteadyLoop, turning_points
+from hilctl.identify.evaluation import StrokeError, largest_errors
 from hilctl.identify.fit_model import FittedModel
 from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.settings import FitSettings
 
 Grade: TypeAlias = Literal["good", "usable", "poor", "not a model"]
 
-GOOD_PERCENT = 2.0
+GOOD_PERCENT = 2.0  # of a motion's own peak-to-peak
 USABLE_PERCENT = 5.0
+ALLOWED = {"tenth stroke": 2.0}  # times these limits, because noise is larger there
 MOST_PERCENT = 25.0  # of a record's own peak-to-peak, the typical error of a straight line
 FOLLOWED = 0.5  # part of the variance of the displacement that a model must explain
 EVEN = 0.5  # correlation with the command's distance from its middle
@@ -32,15 +35,16 @@ class Verdict:
     """Grade of a model."""
 
     grade: Grade  # ``not a model`` if it must not be used; ``good`` needs held-out data
-    within_percent: float  # largest, of a record's own peak-to-peak; held-out data if any
+    within_percent: float  # largest of a class, of a motion's own peak-to-peak
     held_out: bool
     reasons: tuple[str, ...] = ()
     notes: tuple[str, ...] = ()  # limits of the data, and suggestions
+    classes: tuple[StrokeError, ...] = ()  # errors by stroke, on held-out data if any
 
     def __str__(self) -> str:
         if self.reasons:
             return f"not a model: {'; and '.join(self.reasons)}"
-        percent = f"{self.within_percent:.2f} % of a record's own peak-to-peak"
+        percent = f"{errors_text(self.classes)}, of a motion's own peak-to-peak"
         if not self.held_out:
             return f"fit error {percent} (no validation data, so the error elsewhere is unknown)"
         within = {"good": "good: within", "usable": "usable within"}.get(self.grade, "poor: within")
@@ -51,25 +55,35 @@ class Verdict:
         return asdict(self) | {"text": str(self)}
 
 
-def grade_of(within_percent: float, *, known: bool = True) -> Grade:
-    """Return the grade of an error; ``known`` is whether it holds for other motions too."""
-    if within_percent > USABLE_PERCENT:
+def errors_text(classes: Sequence[StrokeError]) -> str:
+    """Return the errors by stroke in words."""
+    return ", ".join(f"{each.peak_percent:.2g} % at {each.label}" for each in classes)
+
+
+def grade_of(classes: Sequence[StrokeError], *, known: bool = True) -> Grade:
+    """Return the grade of errors; ``known`` is whether they hold for other motions too."""
+    worst = max(each.peak_percent / ALLOWED.get(each.label, 1.0) for each in classes)
+    if worst > USABLE_PERCENT:
         return "poor"
-    return "good" if known and within_percent <= GOOD_PERCENT else "usable"
+    return "good" if known and worst <= GOOD_PERCENT else "usable"
 
 
 def verdict_of(
     fit: FittedModel, records: Sequence[Record], settings: FitSettings, held_out: HeldOut | None
 ) -> Verdict:
     """Return the grade of a fit to records, and on held-out data if there are any."""
-    judged = held_out.judgement if held_out else fit
-    within = judged.own_peak_percent
+    # No motion may have a smaller error than the fitted ones, which are more.
+    classes = largest_errors((*(held_out.judgement.classes if held_out else ()), *fit.classes))
+    within = max(each.peak_percent for each in classes)
+    verdict = partial(
+        Verdict, within_percent=within, held_out=held_out is not None, classes=classes
+    )
     if reasons := tuple(data_reasons(records, even=settings.kind == "butterfly")):
-        return Verdict("not a model", within, held_out is not None, reasons)
+        return verdict("not a model", reasons=reasons)
     reasons = tuple(_fit_reasons(fit, records, settings, held_out))
     suggestions = _suggestions(fit, records, settings)
     if reasons:
-        return Verdict("not a model", within, held_out is not None, reasons, tuple(suggestions))
+        return verdict("not a model", reasons=reasons, notes=tuple(suggestions))
     notes = [*_one_frequency(records), *_one_amplitude(records)]
     # Held-out loops of one amplitude or frequency say nothing about others. A PPI has no rate, and
     # its plays follow a whole history up to the largest swing, which determines smaller ones.
@@ -82,8 +96,8 @@ def verdict_of(
         )
     if within > GOOD_PERCENT and (cause := _cause(fit, records, settings)):
         notes.insert(0, cause)
-    grade = grade_of(within, known=known and held_out is not None)
-    return Verdict(grade, within, held_out is not None, notes=(*notes, *suggestions))
+    grade = grade_of(classes, known=known and held_out is not None)
+    return verdict(grade, notes=(*notes, *suggestions))
 
 
 def _fit_reasons(

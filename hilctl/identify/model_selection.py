@@ -1,4 +1,8 @@
-"""Choose the kind of model, its size and the lag of tables by errors on held-out data."""
+"""Choose the kind of model, its size and the lag of tables by errors on held-out data.
+
+A kind is chosen by the geometric mean of its errors by stroke. The rms error of whole histories is
+that of their large motions, and does not show a kind whose small loops are several times worse.
+"""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import dataclass, replace
@@ -118,7 +122,8 @@ def _together(
     responses_um = np.concatenate([modelled for _, modelled, _ in done])
     parts = "histories (their last parts)" if isinstance(held_out[-1], History) else "loops"
     how = f"{len(held_out)} of {len(request.records)} {parts}, held out in turn"
-    judgement = judgement_of(FitData(held_out, request.unit), responses_um)
+    stroke_um = FitData(request.records).stroke_um
+    judgement = judgement_of(FitData(held_out, request.unit), responses_um, stroke_um)
     return HeldOut(judgement, held_out, how, done[-1][2])
 
 
@@ -188,6 +193,7 @@ class CandidateScore:
     settings: str
     rms_percent: float
     peak_percent: float
+    stroke_percent: float  # that kinds are compared by, in percent of the motions' own peak-to-peak
 
 
 @dataclass(frozen=True, slots=True)
@@ -227,16 +233,16 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
         errors += _candidates(request, given, (PLAIN,))
     if not errors:
         raise DataError("too few data to hold some out and select a model: use --model NAME")
-    best = min(errors, key=lambda tried: tried.rms_percent)
-    near = [each for each in errors if each.rms_percent <= NEAR * best.rms_percent]
+    best = min(errors, key=lambda tried: tried.stroke_percent)
+    near = [each for each in errors if each.stroke_percent <= NEAR * best.stroke_percent]
     for turn in range(LONGEST if whole else 0):
         chains = [(IN_FULL.get(each.settings.kind, ())[turn:], each) for each in near]
         larger = [(chain[0], each) for chain, each in chains if chain]
         starts = [each.held_out.end for _, each in larger]
         found = _candidates(request, given, [more for more, _ in larger], starts)
         errors += found
-        better = [x for x in found if x.rms_percent < WORTH * best.rms_percent]
-        best = min(better, key=lambda tried: tried.rms_percent, default=best)
+        better = [x for x in found if x.stroke_percent < WORTH * best.stroke_percent]
+        best = min(better, key=lambda tried: tried.stroke_percent, default=best)
         near = [best] if best in found else []
     return Selection(best.settings, best.held_out, candidates=tuple(e.candidate for e in errors))
 
@@ -268,8 +274,13 @@ class _Tried:
         return self.held_out.judgement.rms_percent
 
     @property
+    def stroke_percent(self) -> float:
+        return self.held_out.judgement.stroke_percent
+
+    @property
     def candidate(self) -> CandidateScore:
-        return CandidateScore(self.name, self.rms_percent, self.held_out.judgement.peak_percent)
+        peak_percent = self.held_out.judgement.peak_percent
+        return CandidateScore(self.name, self.rms_percent, peak_percent, self.stroke_percent)
 
     @property
     def order(self) -> OrderScore:

@@ -1,6 +1,6 @@
 """Identify a model from files or records, evaluate it, and write it."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
 from pathlib import Path
@@ -13,7 +13,7 @@ from hilctl.base.yaml import Document
 from hilctl.identify.data.data_files import load_records
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
+from hilctl.identify.fit_api import FitData, FitRequest, OnProgress, ignore_progress
 from hilctl.identify.fit_model import FittedModel, error_table, fit_model
 from hilctl.identify.model_quality import Verdict, verdict_of
 from hilctl.identify.model_selection import (
@@ -174,15 +174,28 @@ def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Id
     best = with_modes(records, found)
     fit, held_out, selection = best.fit, best.held_out, best.selection
     if validate:
-        others = judge(fit.model, validate, creep=request.settings.creep)
+        stroke_um = FitData(records).stroke_um
+        others = judge(fit.model, validate, creep=request.settings.creep, stroke_um=stroke_um)
         held_out = HeldOut(others, tuple(validate), "files that were not fitted")
-    verdict = verdict_of(fit, records, selection.settings, held_out)
     update: dict[str, Any] = {"created": datetime.now(UTC).isoformat(timespec="seconds")}
     if held_out is not None:
         figures = {f"held_out_{k}": v for k, v in error_table(held_out.judgement).items()}
         update["errors_percent"] = {**fit.model.provenance.errors_percent, **figures}
-    provenance = fit.model.provenance.model_copy(update=update)
-    fit = replace(fit, model=fit.model.model_copy(update={"provenance": provenance}))
-    return Identification(
+    fit = _with_provenance(fit, update)
+    verdict = verdict_of(fit, records, selection.settings, held_out)
+    identification = Identification(
         fit, records, verdict, held_out, selection.orders, 0, selection.candidates
     )
+    return with_verdict(identification, verdict)
+
+
+def with_verdict(found: Identification, verdict: Verdict) -> Identification:
+    """Return an identification with a verdict, whose errors by stroke its model has."""
+    errors = {each.label: each.peak_percent for each in verdict.classes}
+    fit = _with_provenance(found.fit, {"errors_by_stroke": errors})
+    return replace(found, fit=fit, verdict=verdict)
+
+
+def _with_provenance(fit: FittedModel, update: Mapping[str, Any]) -> FittedModel:
+    provenance = fit.model.provenance.model_copy(update=update)
+    return replace(fit, model=fit.model.model_copy(update={"provenance": provenance}))

@@ -4,11 +4,13 @@ from collections.abc import Sequence
 
 from hilctl.identify.evaluation import Evaluation, LoopScore
 from hilctl.identify.fit_model import FittedModel
+from hilctl.identify.model_quality import Verdict
 from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
 
 REFINEMENT_HEADINGS = ("run", "p-p µm", "peak % before", "after", "rms % before", "after")
-CLASS_HEADINGS = ("class", "largest p-p µm", "rms % before", "after")
+CLASS_HEADINGS = ("class", "largest p-p µm", "peak % before", "after", "rms % before", "after")
+STROKE_HEADINGS = ("stroke", "peak %", "rms %", "motions")
 HEADINGS = ("loop", "p-p µm", "peak %", "rms %", "area %")
 
 
@@ -45,8 +47,8 @@ def summary(found: Identification) -> list[str]:
     if held_out is not None:
         lines.append(f"not fitted: {_errors(held_out.judgement)}; {held_out.how}")
     lines += [
-        f"tried: {each.settings}: peak error {each.peak_percent:.2f} %, "
-        f"rms {each.rms_percent:.2f} %"
+        f"tried: {each.settings}: mean error by stroke {each.stroke_percent:.2f} %, "
+        f"peak error {each.peak_percent:.2f} %, rms {each.rms_percent:.2f} %"
         for each in found.candidates
     ]
     lines += [f"fitted: {_errors(fit)}", f"{ended}, in {fit.elapsed_s:.2f} s"]
@@ -88,9 +90,18 @@ def refinement_rows(found: Refinement) -> list[tuple[str, ...]]:
 
 def class_rows(found: Refinement) -> list[tuple[str, ...]]:
     """Return one row per class of held-out runs under :data:`CLASS_HEADINGS`."""
+    rows = []
+    for each in found.choice.classes:
+        figures = [each.peak_to_peak_um, each.peak_before, each.peak_after]
+        rows.append((each.label, *(f"{n:.3g}" for n in (*figures, each.before, each.after))))
+    return rows
+
+
+def stroke_rows(verdict: Verdict) -> list[tuple[str, ...]]:
+    """Return one row per class of motions under :data:`STROKE_HEADINGS`."""
     return [
-        (each.label, *(f"{n:.3g}" for n in (each.peak_to_peak_um, each.before, each.after)))
-        for each in found.choice.classes
+        (each.label, f"{each.peak_percent:.3g}", f"{each.rms_percent:.3g}", f"{each.motions}")
+        for each in verdict.classes
     ]
 
 

@@ -1,5 +1,6 @@
 """Common parts of all models: parameters with their conditions, and streaming operators."""
 
+import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
 from typing import Annotated, Any, Self, TypeAlias
@@ -123,6 +124,22 @@ class Operator:
             self.process(np.array([first_input]))
 
 
+STROKES: Mapping[str, float] = {
+    "full stroke": 1.0,
+    "half stroke": 0.5,
+    "quarter stroke": 0.25,
+    "tenth stroke": 0.1,
+}
+"""Classes of motions: peak-to-peak, of the range that a model was identified on."""
+SMALLEST_STROKE = 0.05
+"""Smallest motion of the last class."""
+
+
+def stroke_class(part: float) -> str:
+    """Return the class of a motion, given as a part of the range: the nearest by ratio."""
+    return min(STROKES, key=lambda name: abs(math.log(part / STROKES[name])))
+
+
 class IdentifiedRange(StrictModel):
     """The motions that a model was identified on; beyond them its error is unknown.
 
@@ -153,6 +170,8 @@ class Provenance(StrictModel):
         grid: The loops used.
         parameters: Fitted parameters by name.
         errors_percent: Model errors, by name, in percent of the peak-to-peak output.
+        errors_by_stroke: Largest expected error of a motion of each class of :data:`STROKES`, in
+            percent of its own peak-to-peak; classes without data are missing.
         identified_range: The motions used; None if unknown.
         versions: Software versions, by name.
         created: Date and time in ISO 8601, UTC.
@@ -163,6 +182,7 @@ class Provenance(StrictModel):
     grid: tuple[str, ...] = ()
     parameters: Mapping[str, float] = Field(default_factory=dict)
     errors_percent: Mapping[str, float] = Field(default_factory=dict)
+    errors_by_stroke: Mapping[str, float] = Field(default_factory=dict)
     identified_range: IdentifiedRange | None = None
     versions: Mapping[str, str] = Field(default_factory=dict)
     created: str = ""

@@ -10,30 +10,40 @@ from dataclasses import dataclass, replace
 
 from hilctl.base.errors import InputError
 from hilctl.identify.evaluation import LoopScore
+from hilctl.models.base import STROKES, stroke_class
 
-CLASSES = {"full stroke": 1.0, "half stroke": 0.5, "quarter stroke": 0.25, "tenth stroke": 0.1}
-"""Peak-to-peak of the references of a class, of the model's range."""
 WORTH = 0.9  # error of one class, of the old one: a smaller gain is not worth the risk
 LOSS = 0.1  # of its old error, by which each run may get worse
 TOLERANCE_PERCENT = 0.2
+PEAK = 3.0  # times the tolerance, by which a run's peak error may rise: noise raises it as well
 
 
 @dataclass(frozen=True, slots=True)
 class ErrorChange:
-    """Rms error of a run or class before and after, in percent of the runs' peak-to-peak."""
+    """Errors of a run or class before and after, in percent of the runs' peak-to-peak."""
 
     label: str
     peak_to_peak_um: float
-    before: float
+    before: float  # rms
     after: float
+    peak_before: float
+    peak_after: float
 
     @property
     def increase(self) -> float:
         """Increase of the error, in percent of the peak-to-peak."""
         return self.after - self.before
 
+    @property
+    def peak_increase(self) -> float:
+        """Increase of the largest error, in percent of the peak-to-peak."""
+        return self.peak_after - self.peak_before
+
     def __str__(self) -> str:
-        return f"{self.label}: rms error {self.after:.3g} % (before {self.before:.3g} %)"
+        rms = f"rms error {self.after:.3g} % (before {self.before:.3g} %)"
+        return (
+            f"{self.label}: {rms}, peak {self.peak_after:.3g} % (before {self.peak_before:.3g} %)"
+        )
 
 
 def error_changes(
@@ -42,7 +52,14 @@ def error_changes(
     """Return the change of each run's error."""
     pairs = zip(before, after, strict=True)
     return tuple(
-        ErrorChange(was.label, was.peak_to_peak_um, was.rms_percent, now.rms_percent)
+        ErrorChange(
+            was.label,
+            was.peak_to_peak_um,
+            was.rms_percent,
+            now.rms_percent,
+            was.peak_percent,
+            now.peak_percent,
+        )
         for was, now in pairs
     )
 
@@ -50,7 +67,11 @@ def error_changes(
 def worst_class(classes: Sequence[ErrorChange]) -> ErrorChange:
     """Return the class with the largest error after, and the largest error of a class before."""
     worst = max(classes, key=lambda each: each.after)
-    return replace(worst, before=max(each.before for each in classes))
+    return replace(
+        worst,
+        before=max(each.before for each in classes),
+        peak_before=max(each.peak_before for each in classes),
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -60,7 +81,7 @@ class AcceptanceRule:
     Attributes:
         range_um: Range of the model, by which runs are classified.
         tolerance_percent: Increase of a run's rms error to accept, in percent of its peak-to-peak;
-            a tenth of its old error is always accepted.
+            three times that for its peak error. A tenth of its old error is always accepted.
     """
 
     range_um: float
@@ -75,15 +96,17 @@ class AcceptanceRule:
 
     def classes(self, runs: Sequence[ErrorChange]) -> list[ErrorChange]:
         """Return the root mean square of the errors of each class that has runs."""
-        members: dict[str, list[ErrorChange]] = {name: [] for name in CLASSES}
+        members: dict[str, list[ErrorChange]] = {name: [] for name in STROKES}
         for run in runs:
-            members[self._class_of(run.peak_to_peak_um)].append(run)
+            members[stroke_class(run.peak_to_peak_um / self.range_um)].append(run)
         return [
             ErrorChange(
                 name,
                 max(run.peak_to_peak_um for run in found),
                 _rms([run.before for run in found]),
                 _rms([run.after for run in found]),
+                max(run.peak_before for run in found),
+                max(run.peak_after for run in found),
             )
             for name, found in members.items()
             if found
@@ -100,28 +123,27 @@ class AcceptanceRule:
             )
         if (worst := worst_class(classes)).increase >= 0.0:
             reasons.append(f"the worst class does not improve ({worst})")
-        if refused := [run for run in runs if run.increase > self._most(run)]:
+        if refused := [run for run in runs if self._excess(run) > 0.0]:
             cure = ""
             if not reasons:
-                least = math.ceil(100.0 * max(run.increase for run in refused)) / 100.0
+                worst_run = max(max(run.increase, run.peak_increase / PEAK) for run in refused)
+                least = math.ceil(100.0 * worst_run) / 100.0
                 cure = (
                     ". Add runs of similar stroke and frequency, or accept it with "
                     f"--tolerance-percent {least:g}"
                 )
             reasons.append(
                 "held-out runs get worse by more than a tenth and "
-                f"{self.tolerance_percent:g} % of their peak-to-peak: "
+                f"{self.tolerance_percent:g} % rms or {PEAK * self.tolerance_percent:g} % peak of "
+                "their peak-to-peak: "
                 f"{', '.join(map(str, refused))}{cure}"
             )
         return reasons
 
-    def _most(self, run: ErrorChange) -> float:
-        return max(LOSS * run.before, self.tolerance_percent)
-
-    def _class_of(self, peak_to_peak_um: float) -> str:
-        return min(
-            CLASSES, key=lambda name: abs(math.log(peak_to_peak_um / self.range_um / CLASSES[name]))
-        )
+    def _excess(self, run: ErrorChange) -> float:
+        most = max(LOSS * run.before, self.tolerance_percent)
+        most_peak = max(LOSS * run.peak_before, PEAK * self.tolerance_percent)
+        return max(run.increase - most, run.peak_increase - most_peak)
 
 
 def _rms(errors: Sequence[float]) -> float:

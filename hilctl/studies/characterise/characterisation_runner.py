@@ -266,7 +266,7 @@ class CharacterisationRunner:
         rest = self._measured.rest
         try:
             found = identified(self._recordings)
-            apart = validated(found.fit.model, self._recordings, rest.noise_um if rest else 0.0)
+            found, apart = validated(found, self._recordings, rest.noise_um if rest else 0.0)
         except InputError as error:
             remedy = "check the loops on the page, or run 'hilctl identify' on the recordings"
             raise RigProblemError("no_model", f"no model identified: {error}", remedy) from None

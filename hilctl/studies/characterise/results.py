@@ -11,10 +11,16 @@ from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
 from hilctl.identify.data.data_files import without_gaps
 from hilctl.identify.data.records import History
-from hilctl.identify.fit_api import FitRequest
+from hilctl.identify.evaluation import MotionError, largest_errors, motions_of, stroke_errors
+from hilctl.identify.fit_api import FitData, FitRequest
 from hilctl.identify.model_quality import MOST_PERCENT, Verdict, grade_of
 from hilctl.identify.parallel import parallel_map, workers
-from hilctl.identify.pipeline import Identification, identify_records, settings_from
+from hilctl.identify.pipeline import (
+    Identification,
+    identify_records,
+    settings_from,
+    with_verdict,
+)
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
@@ -57,8 +63,20 @@ class ValidationReference:
     mean_percent: float  # its mean
     floor_percent: float  # largest error expected from sensor noise alone
     time_s: F64  # float64[n], time of the evaluated samples
+    command: F64  # float64[n], their command
     measured_um: F64  # float64[n], their displacement
     modelled_um: F64  # float64[n], the model's
+
+    def motions(self, stroke_um: float) -> list[MotionError]:
+        """Return its motions, see :func:`hilctl.identify.evaluation.motions_of`."""
+        gaps = np.flatnonzero(np.diff(self.time_s) > 1.5 * np.ptp(self.time_s[:2])) + 1
+        signals = (self.measured_um, self.modelled_um, self.command)
+        parts = zip(*(np.split(signal, gaps) for signal in signals), strict=True)
+        return [
+            motion
+            for measured_um, modelled_um, command in parts
+            for motion in motions_of(measured_um, modelled_um, stroke_um, command)
+        ]
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,17 +122,7 @@ class Characterisation:
     @property
     def verdict(self) -> Verdict | None:
         """Verdict on the model; None without one."""
-        # The random reference resembles a run more closely than held-out loops.
-        if self.identification is None or not self.held_out:
-            return None
-        known, first = self.identification.verdict, self.held_out[0]
-        peak = first.peak_percent
-        if known.grade == "not a model":
-            return known
-        if peak > MOST_PERCENT:
-            reason = f"its error reaches {peak:.0f} % of the peak-to-peak of a {first.label}"
-            return Verdict("not a model", peak, held_out=True, reasons=(reason,))
-        return Verdict(grade_of(peak), peak, held_out=True, notes=known.notes)
+        return self.identification.verdict if self.identification and self.held_out else None
 
     @property
     def is_model(self) -> bool:
@@ -207,14 +215,28 @@ def _history(recording: Recording) -> History:
 
 
 def validated(
-    model: HysteresisModel, recordings: Mapping[str, Path], noise_um: float
-) -> tuple[ValidationReference, ...]:
-    """Validate a model on recordings that were not used to identify it."""
-    return tuple(
-        validate(model, read(recordings[name]), noise_um, label)
+    found: Identification, recordings: Mapping[str, Path], noise_um: float
+) -> tuple[Identification, tuple[ValidationReference, ...]]:
+    """Validate a model on recordings that were not used to identify it, and give the verdict."""
+    references = tuple(
+        validate(found.fit.model, read(recordings[name]), noise_um, label)
         for name, label in VALIDATED.items()
         if name in recordings
     )
+    known = found.verdict
+    if not references or known.grade == "not a model":
+        return found, references
+    peak = references[0].peak_percent
+    if peak > MOST_PERCENT:
+        reason = f"its error reaches {peak:.0f} % of the peak-to-peak of a {references[0].label}"
+        verdict = Verdict("not a model", peak, held_out=True, reasons=(reason,))
+    else:
+        stroke_um = FitData(found.data).stroke_um
+        more = stroke_errors(reference.motions(stroke_um) for reference in references)
+        classes = largest_errors((*known.classes, *more))
+        within = max(each.peak_percent for each in classes)
+        verdict = Verdict(grade_of(classes), within, True, notes=known.notes, classes=classes)
+    return with_verdict(found, verdict), references
 
 
 def validate(
@@ -242,6 +264,7 @@ def validate(
         mean_percent=100.0 * float(error_um.mean()) / whole_um,
         floor_percent=100.0 * floor_um / whole_um,
         time_s=np.flatnonzero(good) / recording.sample_rate_hz,
+        command=command[good],
         measured_um=measured_um[good],
         modelled_um=modelled_um[good],
     )

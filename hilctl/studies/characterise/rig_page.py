@@ -23,7 +23,7 @@ from hilctl.analysis.plot_style import (
 )
 from hilctl.base.formatting import quantity, significant
 from hilctl.base.types import F64
-from hilctl.identify.model_page import drawn_records
+from hilctl.identify.model_page import drawn_records, errors_by_stroke
 from hilctl.identify.summary import HEADINGS, error_rows, summary
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import StagedModel
@@ -216,6 +216,8 @@ def _held_out(found: Characterisation) -> list[str]:
         "<h2>Validation errors</h2>",
         html.paragraph(f"Verdict: {found.verdict}. {noise}"),
         *map(html.paragraph, found.verdict.notes if found.verdict else ()),
+        *(errors_by_stroke(found.verdict) if found.verdict else ()),
+        "<h2>Errors by reference</h2>",
         html.grid(HELD_OUT_HEADINGS, held_out_rows(found)),
         html.figures(
             [

@@ -162,5 +162,5 @@ def test_validation_error_is_printed_first(capsys):
     print_characterisation(found, Path("model.yaml"), Path("model.html"))
     shown = capsys.readouterr().out
     assert shown.index("random reference") < shown.index("noise at rest")
-    assert "verdict: good" in shown
+    assert "verdict: fit error" in shown
     assert "model: model.yaml" in shown

@@ -5,7 +5,7 @@ import pytest
 
 from hilctl.base.segments import Segment
 from hilctl.experiment.model_validity import range_findings, spectrum
-from hilctl.models.base import IdentifiedRange
+from hilctl.models.base import IdentifiedRange, Provenance
 from hilctl.waveforms.build import Reference
 
 RATE_HZ = 10_000.0
@@ -18,7 +18,8 @@ def findings(values_um, frequency_hz=0.0):
     period = RATE_HZ / frequency_hz if frequency_hz else 0.0
     segment = Segment("s", 0, values_um.size, 0, values_um.size, period)
     span = float(values_um.min()), float(values_um.max())
-    return range_findings(KNOWN, Reference(values_um, "um", RATE_HZ, (segment,), span))
+    provenance = Provenance(identified_range=KNOWN, errors_by_stroke={"half stroke": 1.5})
+    return range_findings(provenance, Reference(values_um, "um", RATE_HZ, (segment,), span))
 
 
 def sine(frequency_hz, amplitude=40.0, seconds=1.0):
@@ -29,6 +30,14 @@ def sine(frequency_hz, amplitude=40.0, seconds=1.0):
 def test_within_the_range_there_is_nothing_to_say(frequency_hz):
     found = findings(sine(frequency_hz), frequency_hz)
     assert (found.refused, found.warnings) == ((), ())
+
+
+@pytest.mark.parametrize(("amplitude", "frequency_hz", "percent"), [
+    (20.0, 50.0, 1.5), (40.0, 50.0, None), (20.0, 150.0, None), (10.0, 50.0, None),
+])  # fmt: skip
+def test_expected_error_is_that_of_the_stroke_within_the_range(amplitude, frequency_hz, percent):
+    found = findings(sine(frequency_hz, amplitude), frequency_hz).expected
+    assert (found and found.percent) == percent
 
 
 def test_somewhat_faster_is_warned_and_much_faster_refused():
@@ -79,5 +88,5 @@ def test_a_slow_model_bounds_the_reference_as_well():
     for frequency_hz, warned, refused in ((1.0, 0, 0), (1.6, 1, 0), (2.5, 0, 1)):
         values_um = sine(frequency_hz, seconds=10.0)
         reference = Reference(values_um, "um", RATE_HZ, (segment,), (-40.0, 40.0))
-        found = range_findings(slow, reference)
+        found = range_findings(Provenance(identified_range=slow), reference)
         assert (len(found.warnings), len(found.refused)) == (warned, refused)

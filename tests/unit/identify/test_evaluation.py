@@ -54,6 +54,19 @@ def test_stages_are_judged_sample_by_sample_at_the_rate_of_the_data(loops_of, fr
     assert judge(late, loops_of(model, [(6.0, frequency_hz)], rate_hz=1000.0)).peak_percent > 1.0
 
 
+def test_a_long_record_has_an_error_for_each_stroke():
+    """A constant error of 1 % of the stroke is 2 % of half of it and 10 % of a tenth."""
+    amplitudes = np.repeat([1.0, 0.5, 0.1, 0.01], 1000)
+    command = amplitudes * np.sin(0.02 * np.pi * np.arange(4000))
+    straight = PpiModel(direct=1.0, weights=(), thresholds=())
+    record = History("h", command, command + 0.02, 1000.0)
+    found = {each.label: each for each in judge(straight, [record]).classes}
+    percent = {"full stroke": 1.0, "half stroke": 2.0, "quarter stroke": 4.0, "tenth stroke": 10.0}
+    assert {name: round(each.peak_percent, 1) for name, each in found.items()} == percent
+    doubled = {each.label for each in judge(straight, [record], stroke_um=4.0).classes}
+    assert doubled == {"half stroke", "quarter stroke", "tenth stroke"}
+
+
 TURN = 2.0 * np.pi * np.arange(400) / 400
 
 

@@ -37,7 +37,7 @@ def test_a_model_that_holds_on_what_it_did_not_see_is_good(grid):
     assert not found.verdict.notes
     assert found.held_out.how.startswith("8 of 9 loops")
     errors = found.fit.model.provenance.errors_percent
-    assert errors["held_out_own_peak"] == found.verdict.within_percent
+    assert errors["held_out_own_peak"] == pytest.approx(found.verdict.within_percent)
 
 
 def test_an_error_on_what_was_not_fitted_decides(grid):
@@ -45,7 +45,6 @@ def test_an_error_on_what_was_not_fitted_decides(grid):
     verdict = judged(grid, others).verdict
     assert verdict.grade == "poor"
     assert verdict.within_percent == pytest.approx(10.0, abs=0.5)
-    assert str(verdict).startswith(f"poor: within {verdict.within_percent:.2f} %")
     far = judged(grid, changed(grid[:1], lambda y: y + 0.3 * np.ptp(y))).verdict
     assert far.grade == "not a model"
     assert "'sine 2 A 10 Hz'" in str(far)
@@ -134,7 +133,7 @@ def test_one_frequency_or_amplitude_is_good_for_a_ppi_at_most():
     for command in (np.sin(10.0 * time_s), np.sin(10.0 * time_s) * (3.0 - 0.5 * time_s)):
         displacement_um = TRUTH.forward(1000.0).process(5.0 * command)
         history = History("sine", 5.0 * command, displacement_um, 1000.0)
-        assert judged([history]).verdict.grade == "good"
+        assert judged([history], plays=6).verdict.grade == "good"
         for kind in ("rdpi", "integrated"):
             settings = FitSettings(kind=kind, plays=4, starts=1, weight_by="equal")
             verdict = identify_records(FitRequest([history], settings, "A")).verdict

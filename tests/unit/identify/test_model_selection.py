@@ -9,7 +9,7 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.identify import model_selection
 from hilctl.identify.data.records import History, Record, SteadyLoop
-from hilctl.identify.evaluation import Evaluation
+from hilctl.identify.evaluation import Evaluation, StrokeError
 from hilctl.identify.fit_api import FitRequest, ignore_progress
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.model_selection import (
@@ -109,7 +109,12 @@ def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> li
         if rms is None:
             return None
         judgement = Evaluation(
-            errors=(), modelled_um=(), peak_percent=3.0 * rms, rms_percent=rms, own_peak_percent=0.0
+            errors=(),
+            modelled_um=(),
+            peak_percent=3.0 * rms,
+            rms_percent=rms,
+            own_peak_percent=0.0,
+            classes=(StrokeError("full stroke", 3.0 * rms, rms, 1),),
         )
         return HeldOut(judgement, tuple(request.records), "test", f"end of {name}")
 

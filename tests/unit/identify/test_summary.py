@@ -4,8 +4,9 @@ from types import SimpleNamespace
 
 import pytest
 
-from hilctl.identify.evaluation import LoopScore
+from hilctl.identify.evaluation import LoopScore, StrokeError
 from hilctl.identify.model_quality import Verdict
+from hilctl.identify.model_selection import CandidateScore
 from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
 from hilctl.models.base import IdentifiedRange, Provenance
 
@@ -17,7 +18,8 @@ def found(held_out=None, lag_samples=0, starts=(), at_bound=(), known=None):
         parameters={"a_0": 4.0, "tau_s": 1e-4}, standard_errors={"tau_s": 2e-6}, at_bound=at_bound,
         model=SimpleNamespace(provenance=Provenance(identified_range=known)),
     )  # fmt: skip
-    verdict = Verdict("usable", 4.0, held_out=held_out is not None, notes=("one note",))
+    classes = (StrokeError("full stroke", 4.0, 1.0, 1),)
+    verdict = Verdict("usable", 4.0, held_out is not None, notes=("one note",), classes=classes)
     return SimpleNamespace(
         fit=fit,
         held_out=held_out,
@@ -54,7 +56,7 @@ def test_starts_that_ended_apart_are_shown_by_their_spread():
 def test_what_was_not_fitted_comes_before_what_was():
     judgement = SimpleNamespace(peak_percent=3.0, rms_percent=1.0, own_peak_percent=5.0)
     lines = summary(found(SimpleNamespace(judgement=judgement, how="others"), lag_samples=2))
-    assert lines[0].startswith("usable within 4.00 %")
+    assert lines[0].startswith("usable within 4 % at full stroke")
     assert lines[1] == "one note"
     assert lines[2].startswith("not fitted: peak error 3.00 %")
     assert lines[3].startswith("fitted: peak error 2.50 %")
@@ -71,5 +73,5 @@ def test_the_range_that_it_was_found_for_is_said():
 
 def test_every_kind_that_was_tried_is_said_with_its_error():
     tried = found()
-    tried.candidates = (SimpleNamespace(settings="kind ppi", peak_percent=2.0, rms_percent=0.5),)
-    assert "tried: kind ppi: peak error 2.00 %, rms 0.50 %" in summary(tried)
+    tried.candidates = (CandidateScore("kind ppi", 0.5, 2.0, 0.7),)
+    assert any("kind ppi" in line and "0.70 %" in line for line in summary(tried))

@@ -14,7 +14,8 @@ def runs(*errors):
     """Return runs of the strokes 80, 40, 20 and 8 um with errors before and after."""
     strokes = (80.0, 40.0, 20.0, 8.0)
     return [
-        ErrorChange(f"run {i}", strokes[i % 4], was, now) for i, (was, now) in enumerate(errors)
+        ErrorChange(f"run {i}", strokes[i % 4], was, now, 1.0, 1.0)
+        for i, (was, now) in enumerate(errors)
     ]
 
 
@@ -33,6 +34,11 @@ def runs(*errors):
 ])  # fmt: skip
 def test_a_model_may_trade_a_little_for_its_worst_class(errors, refused):
     assert len(RULE.reasons(runs(*errors))) == refused
+
+
+@pytest.mark.parametrize(("peaks", "refused"), [((1.0, 1.6), 0), ((1.42, 2.11), 1)])
+def test_a_peak_that_rises_refuses_a_smaller_rms_error(peaks, refused):
+    assert len(RULE.reasons([ErrorChange("a", 80.0, 1.0, 0.5, *peaks)])) == refused
 
 
 def test_one_run_a_little_worse_does_not_veto_fourteen_that_are_better():
@@ -55,12 +61,15 @@ def test_suggested_tolerance_accepts_the_model():
     (12.0, "tenth stroke"), (0.1, "tenth stroke"),
 ])  # fmt: skip
 def test_class_of_a_reference(stroke_um, name):
-    assert [each.label for each in RULE.classes([ErrorChange("a", stroke_um, 1.0, 1.0)])] == [name]
+    run = ErrorChange("a", stroke_um, 1.0, 1.0, 1.0, 1.0)
+    assert [each.label for each in RULE.classes([run])] == [name]
 
 
 def test_error_of_a_class_is_the_root_mean_square_of_its_runs():
-    (found,) = RULE.classes([ErrorChange("a", 80.0, 3.0, 1.0), ErrorChange("b", 70.0, 4.0, 1.0)])
+    found_runs = [("a", 80.0, 3.0, 1.0, 5.0, 6.0), ("b", 70.0, 4.0, 1.0, 7.0, 2.0)]
+    (found,) = RULE.classes([ErrorChange(*run) for run in found_runs])
     assert (found.before, found.after) == (pytest.approx(math.sqrt(12.5)), pytest.approx(1.0))
+    assert (found.peak_before, found.peak_after) == (7.0, 6.0)
     assert found.peak_to_peak_um == 80.0
 
 
