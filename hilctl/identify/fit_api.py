@@ -215,6 +215,7 @@ class FitRequest:
     progress: OnProgress = ignore_progress
     start: object | None = None  # start of the search, see :class:`FitJob`
     modes: Sequence[FurtherMode] = ()  # known further modes, for kinds that have them
+    validate: Sequence[Record] = ()  # held out if no part of the others can be
 
 
 @dataclass(frozen=True, slots=True)

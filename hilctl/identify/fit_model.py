@@ -11,10 +11,12 @@ from typing import Any
 
 import numpy as np
 import scipy
+from pydantic import ValidationError
 from scipy.fft import rfft, rfftfreq
 from scipy.optimize import nnls
 
 import hilctl
+from hilctl.base.errors import DataError
 from hilctl.base.types import F64, I64
 from hilctl.experiment.model_validity import ALL, QUIET, spectrum
 from hilctl.identify.data.records import (
@@ -183,7 +185,12 @@ def fit_kind(request: FitRequest) -> FoundModel:
     bare = without_modes(bare, modes) if modes else bare
     data = FitData(bare if settings.kind in EVERY_SAMPLE else thinned(bare), unit)
     job = FitJob(data, settings, request.run, request.progress, request.start)
-    found = CATALOGUE[settings.kind].fit(job)
+    try:
+        found = CATALOGUE[settings.kind].fit(job)
+    except ValidationError as error:
+        rule = f"the best fit of --model {settings.kind} is no valid model"
+        cure = "choose another kind, or remove faulty samples (steps, spikes, drift) from the data"
+        raise DataError(f"{rule} ({error.errors()[0]['msg']}): {cure}") from None
     known, parameters, numbers = dict[str, Any](), dict(found.parameters), found.numbers
     if creep is not None:
         known["creep"] = creep

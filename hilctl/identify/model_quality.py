@@ -26,7 +26,7 @@ EVEN = 0.5  # correlation with the command's distance from its middle
 LIKELY_UM = 500.0
 ALIKE = 1.2  # ratio of amplitudes or frequencies that count as one
 CONSTANT = 0.5  # part of the mean square error that is a constant, or is not a drift
-DRIFT = 0.05  # smallest drift, of the stroke
+DRIFT, FEWEST_TURNS = 0.05, 6  # smallest drift, of the stroke, and turns that show it
 CLEAR_PERCENT = 0.5
 
 
@@ -135,17 +135,27 @@ def _drift(error_um: F64, record: Record) -> str:
     """Return that most of the error in a history is a linear drift of the displacement."""
     if isinstance(record, SteadyLoop):
         return ""
-    time_s = record.time_s[-error_um.size :]
-    slope, start = np.polyfit(time_s, error_um, 1)
-    moved_um = float(slope * np.ptp(time_s))
-    left_um = error_um - slope * time_s - start
-    small = abs(moved_um) < DRIFT * np.ptp(record.displacement_um)
-    if small or left_um.var() > CONSTANT * error_um.var():
-        return ""
-    return (
-        f"drifts by about {-slope:.2g} µm/s from {time_s[0]:.4g} to "
-        f"{time_s[-1]:.4g} s: subtract the drift, or measure again with a warm sensor and actuator"
+    first = record.command.size - error_um.size
+    turns = turning_points(record.command[first:])
+    # A model of decaying motions hides drift, which the middles of their swings show.
+    times_s, middles, middles_um = (
+        0.5 * (each[first:][turns][1:] + each[first:][turns][:-1])
+        for each in (record.time_s, record.command, record.displacement_um)
     )
+    signals = [(record.time_s[first:], -error_um)]
+    if turns.size > FEWEST_TURNS:
+        straight = np.polyval(np.polyfit(middles, middles_um, 1), middles)
+        signals.append((times_s, middles_um - straight))
+    for time_s, off_um in signals:
+        slope, start = np.polyfit(time_s, off_um, 1)
+        left_um = off_um - slope * time_s - start
+        large = abs(slope) * np.ptp(time_s) > DRIFT * np.ptp(record.displacement_um)
+        if large and left_um.var() < CONSTANT * off_um.var():
+            return (
+                f"drifts by about {slope:.2g} µm/s from {time_s[0]:.4g} to {time_s[-1]:.4g} s: "
+                "subtract the drift, or measure again with a warm sensor and actuator"
+            )
+    return ""
 
 
 def _unfollowed(records: Sequence[Record]) -> str:

@@ -50,19 +50,27 @@ class HeldOut:
         return self.judgement.to_mapping() | {"how": self.how}
 
 
-def folds_of(records: Sequence[Record]) -> list[Split]:
+def folds_of(records: Sequence[Record], validate: Sequence[Record] = ()) -> list[Split]:
     """Return the folds; none if there are too few data.
 
     Records that extend the range of commands, frequencies or speeds are not held out, since a model
-    need not be valid beyond its range. Of histories the last part is held out.
+    need not be valid beyond its range. Of histories the last part is held out, or each in turn if
+    no last part is within the range of the rest. Otherwise ``validate`` is held out.
     """
+    given = [Split(tuple(records), tuple(validate))] if validate else []
     if any(isinstance(record, History) for record in records):
         heads, tails = zip(*map(_halved, records), strict=True)
         held_out = tuple(tail for tail in tails if tail is not None)
-        return [Split(heads, held_out)] if held_out else []
+        if held_out:
+            return [Split(heads, held_out)]
+        folds = [
+            Split((*records[:i], *records[i + 1 :]), (record,)) for i, record in enumerate(records)
+        ]
+        inner = [each for each in folds if each.fitted and _within(each.held_out[0], each.fitted)]
+        return inner or given
     if len(records) < FEWEST_LOOPS:
-        return []
-    folds = []
+        return given
+    divided = []
     # Every third of a grid in its own order would be all loops of one frequency.
     mixed = np.random.default_rng(SEED).permutation(len(records)).tolist()
     for first in range(FOLDS):
@@ -71,8 +79,8 @@ def folds_of(records: Sequence[Record]) -> list[Split]:
         out = [records[i] for i in members if _within(records[i], rest)]
         fitted = tuple(r for r in records if not any(r is other for other in out))
         if out:
-            folds.append(Split(fitted, tuple(out)))
-    return folds
+            divided.append(Split(fitted, tuple(out)))
+    return divided or given
 
 
 def held_out_error(request: FitRequest) -> HeldOut | None:
@@ -93,7 +101,7 @@ def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[He
             progress=ignore_progress,
         ))
         for number, request in enumerate(requests)
-        for fold in folds_of(request.records)
+        for fold in folds_of(request.records, request.validate)
     ]  # fmt: skip
     done: list[list[tuple[Split, F64, object | None]]] = [[] for _ in requests]
     for (number, fold, _), found in zip(tasks, run(_fitted, tasks), strict=True):
@@ -120,7 +128,7 @@ def _together(
         return None
     held_out = tuple(record for fold, _, _ in done for record in fold.held_out)
     responses_um = np.concatenate([modelled for _, modelled, _ in done])
-    parts = "histories (their last parts)" if isinstance(held_out[-1], History) else "loops"
+    parts = "histories (or their last parts)" if isinstance(held_out[-1], History) else "loops"
     how = f"{len(held_out)} of {len(request.records)} {parts}, held out in turn"
     stroke_um = FitData(request.records).stroke_um
     judgement = judgement_of(FitData(held_out, request.unit), responses_um, stroke_um)
@@ -167,7 +175,7 @@ WHOLE: tuple[Mapping[str, Any], ...] = (
 """Candidates for histories: a small model of each kind, which is identified quickly."""
 PLAIN: Mapping[str, Any] = {"kind": "integrated", "offset": True}
 """Further candidate for histories if the error of all others is large."""
-WELL_PERCENT = 1.0  # rms, of the stroke: small models of the right kind reach a third of it
+WELL_PERCENT = 0.4  # mean error by stroke that small models of the right kind reach
 IN_FULL: Mapping[str, tuple[Mapping[str, Any], ...]] = {
     "field": ({"kind": "field", "drags": 0}, {"kind": "field"}),
     "generalised_duhem": ({"kind": "generalised_duhem"},),
@@ -229,10 +237,10 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
     # Small models select the kinds to try at full size: a wrong kind is far off at any size.
     whole = any(isinstance(record, History) for record in request.records)
     errors = _candidates(request, given, WHOLE if whole else LOOPS)
-    if whole and not any(each.rms_percent < WELL_PERCENT for each in errors):
+    if whole and not any(each.stroke_percent < WELL_PERCENT for each in errors):
         errors += _candidates(request, given, (PLAIN,))
     if not errors:
-        raise DataError("too few data to hold some out and select a model: use --model NAME")
+        raise DataError(f"too few data to select a kind of model: {_undivided(request.records)}")
     best = min(errors, key=lambda tried: tried.stroke_percent)
     near = [each for each in errors if each.stroke_percent <= NEAR * best.stroke_percent]
     for turn in range(LONGEST if whole else 0):
@@ -245,6 +253,21 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
         best = min(better, key=lambda tried: tried.stroke_percent, default=best)
         near = [best] if best in found else []
     return Selection(best.settings, best.held_out, candidates=tuple(e.candidate for e in errors))
+
+
+def _undivided(records: Sequence[Record]) -> str:
+    """Return why nothing was held out, with a remedy."""
+    record = records[0]
+    if not isinstance(record, History):
+        return (
+            f"{len(records)} steady loops, at least {FEWEST_LOOPS} are needed. Add loops at other "
+            "amplitudes and frequencies, or set --model staged"
+        )
+    cut_s = record.time_s[record.ignore + round(HEAD * (record.command.size - record.ignore))]
+    return (
+        f"from {cut_s:.4g} s, '{record.label}' moves further or faster than before, or hardly. "
+        "Add a file of other motions with --validate, or set --model field"
+    )
 
 
 def _choose_order(request: FitRequest) -> Selection:

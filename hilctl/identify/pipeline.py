@@ -162,7 +162,7 @@ def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Id
     records = request.records
 
     def found(modes: Sequence[FurtherMode]) -> Found:
-        asked = replace(request, modes=modes)
+        asked = replace(request, modes=modes, validate=validate)
         selection = select(asked)
         held_out = selection.held_out
         chosen = replace(asked, settings=selection.settings)
@@ -176,7 +176,10 @@ def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Id
     if validate:
         stroke_um = FitData(records).stroke_um
         others = judge(fit.model, validate, creep=request.settings.creep, stroke_um=stroke_um)
-        held_out = HeldOut(others, tuple(validate), "files that were not fitted")
+        how = "files that were not fitted"
+        if held_out is not None and held_out.records[0] is validate[0]:
+            how += ", but selected the kind of model"
+        held_out = HeldOut(others, tuple(validate), how)
     update: dict[str, Any] = {"created": datetime.now(UTC).isoformat(timespec="seconds")}
     if held_out is not None:
         figures = {f"held_out_{k}": v for k, v in error_table(held_out.judgement).items()}

@@ -18,6 +18,7 @@ SPIKE_STROKE = 0.1  # smallest spike, of the stroke of all other samples
 JUMP = 0.05  # of the command's range: a step of the command is no fault
 CLIPPED, FEWEST_CLIPPED = 0.05, 5  # motion of the command, of its range, and samples at one value
 LARGE = 0.1  # of the largest swing: smaller ones are ignored
+OWN_OFFSET = ("field", "generalised_duhem")  # kinds whose offset is fitted always
 DEAD, FEWEST_DEAD = 0.1, 2  # of the usual displacement per command; swings in a row
 
 
@@ -155,6 +156,8 @@ def _first_row(record: Record, settings: FitSettings) -> int | None:
 
 def _far_from_zero(record: Record, settings: FitSettings) -> str:
     """Return that the displacement has a constant that the model lacks."""
+    if settings.kind in OWN_OFFSET:
+        return ""
     middle_um = 0.5 * float(record.displacement_um.max() + record.displacement_um.min())
     if abs(middle_um) < float(np.ptp(record.displacement_um)):
         return ""

@@ -2,6 +2,7 @@
 
 import logging
 from collections.abc import Iterable, Sequence
+from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, cast, get_args
@@ -15,7 +16,7 @@ from hilctl.base.table_file import open_table
 from hilctl.base.types import F64, I64, CommandUnit
 from hilctl.identify.data.cycles import find_cycles, loops_from_pieces
 from hilctl.identify.data.data_faults import correlation
-from hilctl.identify.data.records import History, Record
+from hilctl.identify.data.records import History, Record, turning_points
 from hilctl.identify.settings import IdentifySettings, TableSettings
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.recording import Recording
@@ -154,10 +155,9 @@ def load_records(
         if not kept:
             continue
         if first is None:
-            read = read_table(path, settings.table)
-            history = read.history.without_lag(lag_samples)
-            understood.append(read.understood)
-            units |= {read.unit} if read.unit else set()
+            history, unit, text = _from_table(path, settings, lag_samples)
+            understood.append(text)
+            units |= {unit} if unit else set()
             records.append(history if settings.whole else find_cycles(history, settings.points))
         elif settings.whole:
             records.append(history_from_pieces(chain([first], pieces)))
@@ -173,6 +173,38 @@ def load_records(
     if known and not records:
         raise InputError("--leave-out excludes all records")
     return LoadedRecords(records, next(iter(units), None), understood)
+
+
+def _from_table(path: Path, settings: IdentifySettings, lag_samples: int) -> TableRecord:
+    """Read a table whose displacement lags; a whole history is evaluated from a known state."""
+    read = read_table(path, settings.table)
+    history, text = read.history.without_lag(lag_samples), read.understood
+    if settings.whole and (known := from_known_state(history)) is not history:
+        begin_s = known.time_s[known.ignore]
+        text += f"; not evaluated before {begin_s:.3g} s, because its state is unknown until then"
+        history = known
+    return TableRecord(history, read.unit, text)
+
+
+AT_REST = 0.01  # of the range of a command: it begins at rest
+AT_END = 0.05  # of the range of a command: it is at an end of it
+
+
+def from_known_state(history: History) -> History:
+    """Return a history that is not evaluated until its own motion determines its state.
+
+    A history that does not begin at a command of 0 has an unknown past, which the first motion
+    over the range erases. If that is not in its first half, its first turn ends the worst of it.
+    """
+    command = history.command
+    span = float(np.ptp(command))
+    if history.ignore or abs(command[0]) < AT_REST * span:
+        return history
+    ends = command <= command.min() + AT_END * span, command >= command.max() - AT_END * span
+    erased = max(int(end.argmax()) for end in ends)
+    if erased > command.size // 2:
+        erased = int(next(iter(turning_points(command)), 0))
+    return replace(history, ignore=erased) if erased <= command.size // 2 else history
 
 
 _MOST_MISSING = 0.01  # share of samples

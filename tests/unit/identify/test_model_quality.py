@@ -86,6 +86,14 @@ def test_what_a_campaign_can_t_know_is_said_and_nothing_is_good(grid, chosen, no
     assert any(note in each for each in verdict.notes)
 
 
+def test_drift_that_a_model_of_decaying_motions_hides_is_named():
+    time_s = np.arange(20_000) / 1000.0
+    command = (6.0 - 0.27 * time_s) * np.sin(2.0 * np.pi * time_s)
+    drifting_um = TRUTH.forward(1000.0).process(command) + 0.4 * time_s
+    verdict = judged([History("decay", command, drifting_um, 1000.0)]).verdict
+    assert any("drifts by" in text for text in (*verdict.reasons, *verdict.notes)), verdict
+
+
 def test_an_offset_is_suggested_where_the_error_is_one(grid):
     moved = changed(grid, lambda y: y + 4.0)
     verdict = judged(moved).verdict

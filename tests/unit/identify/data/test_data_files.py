@@ -304,3 +304,16 @@ def test_units_in_doubt_are_refused_until_an_option_confirms_them(tmp_path, head
             assert f"--{key.replace('_', '-')} {value:g}" in str(caught.value)
         given = {**columns, **cure, **({"time_column": None} if key == "rate_hz" else {})}
         assert read_table(tmp_path / "t.csv", TableSettings(**given)).history.command.size == 200
+
+
+@pytest.mark.parametrize(("bias", "envelope", "ignored"), [
+    (0.0, (1.0, 1.0), 0),  # from rest
+    (2.0, (1.0, 1.0), 72),  # until it has been at both ends
+    (2.0, (0.3, 1.0), 25),  # its largest motion is the last: until it first turns
+])  # fmt: skip
+def test_a_history_from_an_unknown_state_is_evaluated_once_its_motion_determines_it(
+    bias, envelope, ignored
+):
+    command = bias + np.linspace(*envelope, 1000) * np.sin(0.02 * np.pi * np.arange(1000))
+    found = data_files.from_known_state(History("h", command, 5.0 * command, 100.0))
+    assert found.ignore == pytest.approx(ignored, abs=5)
