@@ -181,7 +181,7 @@ DEFINITIONS = {
     "loop area": "Area enclosed by displacement against input.",
     "peak and rms error": (
         "Displacement less reference, offset included: largest magnitude, and root mean square, "
-        "over the peak-to-peak displacement."
+        "over the peak-to-peak reference."
     ),
     "asymmetry": (
         "Difference of the highest and the lowest displacement from rest, over the peak-to-peak."

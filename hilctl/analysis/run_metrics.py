@@ -28,7 +28,7 @@ class RunMetrics:
         loop_area: Area enclosed by the loop, in um times the input's unit.
         peak_to_peak_um: Peak-to-peak displacement.
         peak_error_percent: Largest displacement less reference, offset included, over the
-            peak-to-peak displacement; the raw error without a period.
+            peak-to-peak reference; the raw error without a period.
         rms_error_percent: Its root mean square.
         peak_error_raw_percent: Peak error of all steady samples without averaging.
         rms_error_raw_percent: Its root mean square.

@@ -16,6 +16,21 @@ from hilctl.signals import cycle_metrics
 _UNKNOWN: tuple[float | None, float | None] = (None, None)
 
 
+class _Extremes:
+    """Lowest and highest value of a signal that arrives in pieces."""
+
+    def __init__(self) -> None:
+        self._low, self._high = math.inf, -math.inf
+
+    def add(self, values: F64) -> None:
+        self._low = min(self._low, float(values.min()))
+        self._high = max(self._high, float(values.max()))
+
+    @property
+    def span(self) -> float:
+        return self._high - self._low
+
+
 class SegmentReportBuilder:
     """Builder of the metrics of a segment from its evaluated samples.
 
@@ -33,7 +48,7 @@ class SegmentReportBuilder:
         self._start, self._stop, self._cycles = window
         self._folding = cycle_metrics.CycleAverager(segment.period, 2) if self._cycles else None
         self._samples = self._steady = 0
-        self._lowest_um, self._highest_um = math.inf, -math.inf
+        self._input, self._output = _Extremes(), _Extremes()
         self._averaged, self._raw = _Errors(), _Errors()
         self._noise = _Noise()
 
@@ -67,34 +82,34 @@ class SegmentReportBuilder:
         finite = np.isfinite(loop_input) & np.isfinite(output)
         if not finite.any():
             return
-        known = output[finite]
-        self._lowest_um = min(self._lowest_um, float(known.min()))
-        self._highest_um = max(self._highest_um, float(known.max()))
-        self._averaged.add(known - loop_input[finite])
+        self._input.add(loop_input[finite])
+        self._output.add(output[finite])
+        self._averaged.add(output[finite] - loop_input[finite])
 
     @np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
     def report(self) -> SegmentReport:
         """Return the metrics; None for those that are not available."""
         cycle = self.cycle()
         noise_um = self._noise.rms_um()
-        stroke_um = hysteresis = area = floor = None
+        stroke_um = wanted_um = hysteresis = area = floor = None
         errors = raw = _UNKNOWN
         if cycle is not None and cycle.whole:
             loop_input, output = cycle.signals
             stroke_um = cycle_metrics.peak_to_peak(output)
-            errors = cycle_metrics.peak_and_rms_percent(output - loop_input, stroke_um)
+            wanted_um = cycle_metrics.peak_to_peak(loop_input)
+            errors = cycle_metrics.peak_and_rms_percent(output - loop_input, wanted_um)
             if self._segment.is_loop:
                 hysteresis = cycle_metrics.peak_hysteresis_percent(loop_input, output)
                 area = cycle_metrics.loop_area(loop_input, output)
             if hysteresis is not None and noise_um is not None:
                 floor = cycle_metrics.noise_floor_percent(noise_um, cycle.counts, stroke_um)
         elif cycle is None and self._averaged.count:
-            stroke_um = self._highest_um - self._lowest_um
-            errors = self._averaged.percent(stroke_um)
+            stroke_um, wanted_um = self._output.span, self._input.span
+            errors = self._averaged.percent(wanted_um)
         if not self._compensated:
             errors = _UNKNOWN
-        elif stroke_um is not None:
-            raw = self._raw.percent(stroke_um)
+        elif wanted_um is not None:
+            raw = self._raw.percent(wanted_um)
         period = self._segment.period
         return SegmentReport(
             label=self._segment.label,

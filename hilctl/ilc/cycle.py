@@ -29,6 +29,7 @@ class CycleScore:
         harmonics_um: complex128[K + 1], coefficients c_k of displacement less reference.
         noise_um: float64[K + 1], their standard deviations, from the scatter of the cycles.
         peak_um: Peak error of the average cycle, as in reports.
+        peak_to_peak_um: Peak-to-peak of the reference.
         floor_um: Peak error that sensor noise alone would cause.
         strongest_hz: Frequency of the reference's strongest harmonic.
         answer: Displacement over reference at that frequency.
@@ -52,7 +53,7 @@ class CycleScore:
 
     @property
     def percent(self) -> float:
-        """Peak error in percent of the peak-to-peak displacement."""
+        """Peak error in percent of the reference's peak-to-peak."""
         return 100.0 * self.peak_um / self.peak_to_peak_um
 
     @property
@@ -68,8 +69,8 @@ def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> Cy
         rule = f"{segment.label}: needs at least {_FEWEST_CYCLES} whole steady cycles"
         raise DataError(f"{recording.path}: {rule}, got {part.cycles}")
     reference, displacement = part.cycle.signals
-    whole = cycle_metrics.peak_to_peak(displacement)
-    if not (whole > 0.0 and np.ptp(reference) > 0.0):
+    whole = cycle_metrics.peak_to_peak(reference)
+    if not (whole > 0.0 and np.ptp(displacement) > 0.0):
         raise DataError(f"{recording.path}: {segment.label}: nothing moved")
     step_hz = recording.sample_rate_hz / segment.period
     count = harmonic_count(segment.period, step_hz, highest_hz)

@@ -18,11 +18,9 @@ from hilctl.run.metadata import LimitBounds, RunDescription
 from hilctl.signals.cycle_metrics import (
     CycleAverager,
     noise_floor_percent,
-    peak,
+    peak_and_rms_percent,
     peak_hysteresis_percent,
     peak_to_peak,
-    percent,
-    rms,
     sensor_noise_um,
 )
 
@@ -245,9 +243,8 @@ class _Group:
         if self._is_loop and noise_um is not None:
             found["noise_floor_percent"] = noise_floor_percent(noise_um, cycle.counts, stroke_um)
         if self._errors:
-            error_um = output - loop_input
-            found["peak_error_percent"] = percent(peak(error_um), stroke_um)
-            found["rms_error_percent"] = percent(rms(error_um), stroke_um)
+            errors = peak_and_rms_percent(output - loop_input, peak_to_peak(loop_input))
+            found["peak_error_percent"], found["rms_error_percent"] = errors
         return found
 
 

@@ -131,8 +131,9 @@ class RunFigures:
 
     Attributes:
         peak_hysteresis_percent: Peak hysteresis, of the segment with the largest.
-        peak_error_percent: Largest error (displacement minus reference), of the peak-to-peak.
-        rms_error_percent: rms error, of the peak-to-peak.
+        peak_error_percent: Largest error (displacement minus reference), of the reference's
+            peak-to-peak.
+        rms_error_percent: rms error, of the same.
         loop_area: Area of the loop, in um times the unit of its input.
         peak_to_peak_um: Peak-to-peak displacement.
         low_um: Lowest displacement of the average cycle.
