@@ -150,9 +150,10 @@ def motions_of(
     for place in starmap(slice, sorted(places or {(0, measured_um.size)})):
         error_um, span_um = modelled_um[place] - measured_um[place], np.ptp(measured_um[place])
         label = stroke_class(float(span_um) / stroke_um)
-        # Parts of histories are as large as their class allows, but stand for all of it.
-        largest_um = STROKES[label] * stroke_um if places else math.inf
-        to_percent = 100.0 / min(float(span_um), largest_um)
+        if places and STROKES[label] < 1.0:
+            # Parts of histories are as large as their class allows, but stand for all of it.
+            span_um = min(span_um, STROKES[label] * stroke_um)
+        to_percent = 100.0 / float(span_um)
         errors_um = cycle_metrics.peak(error_um), cycle_metrics.rms(error_um)
         found.append(MotionError(label, *(to_percent * each for each in errors_um)))
     return found

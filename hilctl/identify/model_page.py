@@ -40,7 +40,7 @@ def identification_page(found: Identification) -> str:
     """Return the page as HTML."""
     fit = found.fit
     unit = fit.model.input_unit
-    body = _head("Identified model", fit.model, [fit.model.provenance.method, *summary(found)])
+    body = _head("Identified model", fit.model, [*summary(found), fit.model.provenance.method])
     body += errors_by_stroke(found.verdict)
     if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on data not fitted</h2>"]
@@ -71,13 +71,14 @@ def errors_by_stroke(verdict: Verdict) -> list[str]:
         strokes = [100.0 * STROKES[each.label] for each in verdict.classes]
         for name, colour in (("peak", ERROR), ("rms", DISPLACEMENT)):
             errors = [getattr(each, f"{name}_percent") for each in verdict.classes]
-            axes.loglog(strokes, errors, "o-", color=colour, label=name)
+            axes.semilogx(strokes, errors, "o-", color=colour, label=name)
         axes.set_xticks(strokes, [f"{stroke:g}" for stroke in strokes])
         axes.minorticks_off()
-        axes.yaxis.set_major_formatter("{x:g}")
-        axes.set(xlabel="peak-to-peak, % of the stroke", ylabel="error, % of its peak-to-peak")
+        axes.set_ylim(bottom=0.0)
+        axes.set(xlabel="motion, % of the stroke", ylabel="error, %")
 
-    figure = FigureSpec("strokes", "Largest error by stroke.", (Panel(draw, height=0.5),))
+    caption = "Errors by stroke, in percent of a motion's own peak-to-peak."
+    figure = FigureSpec("strokes", caption, (Panel(draw, height=0.5),))
     return [
         "<h2>Errors by stroke</h2>",
         html.grid(STROKE_HEADINGS, stroke_rows(verdict)),

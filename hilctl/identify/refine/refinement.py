@@ -221,7 +221,7 @@ class Regularisation:
         if own:
             responses_um = data.with_creep(responses_um)
             how += ", without an offset and creep per recording"
-        return HeldOut(judgement_of(data, responses_um), records, how)
+        return HeldOut(judgement_of(data, responses_um, self._rule.range_um), records, how)
 
 
 STILL_S = 1.0  # between a run and the one that began where it ended
@@ -377,12 +377,14 @@ def _provenance(
     was = old.provenance
     data = FitData(runs, old.input_unit)
     figures = {f"held_out_{k}": v for k, v in error_table(choice.after.judgement).items()}
+    by_stroke = {each.label: each.peak_percent for each in choice.after.judgement.classes}
     labels = tuple(run.label for run in runs)
     return was.model_copy(
         update={
             "source": (*was.source, *([source] if source else []), *labels),
             "method": f"{was.method}; refined on {len(runs)} runs, strength {choice.strength:g}",
             "errors_percent": figures,
+            "errors_by_stroke": {**was.errors_by_stroke, **by_stroke},
             "identified_range": _wider(was.identified_range, identified_range(data)),
             "versions": VERSIONS,
             "created": datetime.now(UTC).isoformat(timespec="seconds"),

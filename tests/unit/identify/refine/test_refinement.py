@@ -125,6 +125,7 @@ def test_provenance_says_what_it_was_refined_on(found):
     assert found.source == ("old.yaml", "run 0", "run 1", "run 2", "run 3", "run 4")
     assert "5 runs" in found.method
     assert {"held_out_peak", "held_out_rms"} <= found.errors_percent.keys()
+    assert "full stroke" in found.errors_by_stroke
     assert found.identified_range is not None
 
 
