@@ -148,12 +148,13 @@ def motions_of(
         places = set(_cut(measured_um, turns, stroke_um))
     found = []
     for place in starmap(slice, sorted(places or {(0, measured_um.size)})):
-        error_um, span_um = modelled_um[place] - measured_um[place], np.ptp(measured_um[place])
-        label = stroke_class(float(span_um) / stroke_um)
+        error_um = modelled_um[place] - measured_um[place]
+        span_um = float(np.ptp(measured_um[place]))
+        label = stroke_class(span_um / stroke_um)
         if places and STROKES[label] < 1.0:
             # Parts of histories are as large as their class allows, but stand for all of it.
             span_um = min(span_um, STROKES[label] * stroke_um)
-        to_percent = 100.0 / float(span_um)
+        to_percent = 100.0 / span_um
         errors_um = cycle_metrics.peak(error_um), cycle_metrics.rms(error_um)
         found.append(MotionError(label, *(to_percent * each for each in errors_um)))
     return found
