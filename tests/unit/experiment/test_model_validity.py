@@ -32,9 +32,15 @@ def test_within_the_range_there_is_nothing_to_say(frequency_hz):
     assert (found.refused, found.warnings) == ((), ())
 
 
-@pytest.mark.parametrize(("amplitude", "frequency_hz", "percent"), [
-    (20.0, 50.0, 1.5), (40.0, 50.0, None), (20.0, 150.0, None), (10.0, 50.0, None),
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("amplitude", "frequency_hz", "percent"),
+    [
+        (20.0, 50.0, 1.5),
+        (40.0, 50.0, None),
+        (20.0, 150.0, None),
+        (10.0, 50.0, None),
+    ],
+)
 def test_expected_error_is_that_of_the_stroke_within_the_range(amplitude, frequency_hz, percent):
     found = findings(sine(frequency_hz, amplitude), frequency_hz).expected
     assert (found and found.percent) == percent

@@ -306,11 +306,14 @@ def test_units_in_doubt_are_refused_until_an_option_confirms_them(tmp_path, head
         assert read_table(tmp_path / "t.csv", TableSettings(**given)).history.command.size == 200
 
 
-@pytest.mark.parametrize(("bias", "envelope", "ignored"), [
-    (0.0, (1.0, 1.0), 0),  # from rest
-    (2.0, (1.0, 1.0), 72),  # until it has been at both ends
-    (2.0, (0.3, 1.0), 25),  # its largest motion is the last: until it first turns
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("bias", "envelope", "ignored"),
+    [
+        (0.0, (1.0, 1.0), 0),  # from rest
+        (2.0, (1.0, 1.0), 72),  # until it has been at both ends
+        (2.0, (0.3, 1.0), 25),  # its largest motion is the last: until it first turns
+    ],
+)
 def test_a_history_from_an_unknown_state_is_evaluated_once_its_motion_determines_it(
     bias, envelope, ignored
 ):

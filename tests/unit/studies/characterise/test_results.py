@@ -52,9 +52,9 @@ def identification(grade="usable"):
     return replace(found, verdict=Verdict(grade, 9.0, False, reasons, ("a note",)))
 
 
-@pytest.mark.parametrize(("off_percent", "grade"), [
-    (1.5, "good"), (4.5, "usable"), (6.0, "poor"), (30.0, "not a model")
-])  # fmt: skip
+@pytest.mark.parametrize(
+    ("off_percent", "grade"), [(1.5, "good"), (4.5, "usable"), (6.0, "poor"), (30.0, "not a model")]
+)
 def test_the_verdict_follows_the_errors_by_stroke_of_the_validation(
     run, monkeypatch, off_percent, grade
 ):
