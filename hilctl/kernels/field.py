@@ -13,7 +13,10 @@ which may be wider.
 The command leads the field by the losses, in the mean over a sample::
 
     v = w + z,  z + tau_b z' = h(e),  e = tau_0 w' + tau_1 m',
-    h(e) = e (1 + b |e| + c e^2 + x / sqrt(|e| + e_0))
+    h(e) = e (1 / (1 - g |e|) + b |e| + c e^2 + x / sqrt(|e| + e_0))
+
+The part with g is that of a lag that grows with its own loss, z = e (1 + g |z|). It has a pole,
+before which, at g |e| = 0.9, it continues along its tangent: so h rises for all e.
 
 Memory, float64[p + d c + 3 d + 6]: the plays' outputs, each drag's in each of c cells relative to
 rest, three sums over each drag, then u, m, z, w, the last du/dv (du/dm in the inverse), and the
@@ -39,10 +42,11 @@ Bank: TypeAlias = tuple[F64, F64, F64, F64, F64]
 p (n + 1)], weights of the drags in c cells, float64[d c], and the grid, float64[5]: lowest edge,
 width and n for the plays, width and c for the drags."""
 Span: TypeAlias = tuple[float, float, float]
-Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float]
-"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, e_0, and the part that z before
-a sample has in its mean over the sample; the rest is h's."""
+Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, g, e_0, and the part that z
+before a sample has in its mean over the sample; the rest is h's."""
 
+_BEFORE_POLE = 0.9
 _STEPS = 100
 _NARROWEST = 1e-14
 _NEAR = 1e-7  # of a change, and of its unit, to which it is worked out
@@ -50,7 +54,7 @@ _OUTPUT, _COMMAND, _FIELD = 0, 1, 2
 _SPAN = "UniTuple(float64, 3)"
 _CURVE = "UniTuple(float64[::1], 2)"
 _BANK = "UniTuple(float64[::1], 5)"
-_ARRAY, _LOSSES = "float64[::1]", "UniTuple(float64, 8)"
+_ARRAY, _LOSSES = "float64[::1]", "UniTuple(float64, 9)"
 _RUN = f"void({_ARRAY}, {_SPAN}, {_BANK}, float64, {_LOSSES}, {_CURVE}, {_ARRAY}, {_ARRAY})"
 
 
@@ -261,13 +265,18 @@ def _settle(u: float, memory: F64, bank: Bank) -> None:
 @kernel(f"UniTuple(float64, 2)(float64, {_LOSSES})", inline=True)
 def lost_field(e: float, losses: Losses) -> tuple[float, float]:
     """Return h(e) and its slope."""
-    growth, bend, excess, even = losses[3:7]
+    growth, bend, excess, self_growth, even = losses[3:8]
     size = abs(e)
     root = math.sqrt(size + even)
     more = growth * size + bend * size * size
-    slope = 1.0 + 2.0 * more + bend * size * size
+    part = self_growth * size
+    near = min(part, _BEFORE_POLE)
+    grown = 1.0 / (1.0 - near)
+    slope = grown * grown + 2.0 * more + bend * size * size
     slope += excess / root * (1.0 - 0.5 * size / (size + even))
-    return e * (1.0 + more + excess / root), slope
+    if part > near:
+        grown *= grown * (part - near * near) / part
+    return e * (grown + more + excess / root), slope
 
 
 @kernel(
@@ -318,9 +327,9 @@ def _given(
     k = memory.size - 6
     e = losses[0] * (w - memory[k + 3]) + losses[1] * (m - memory[k + 1])
     lost, lost_slope = lost_field(e, losses)
-    command = 0.5 * (w + memory[k + 3]) + losses[7] * memory[k + 2] + (1.0 - losses[7]) * lost
+    command = 0.5 * (w + memory[k + 3]) + losses[8] * memory[k + 2] + (1.0 - losses[8]) * lost
     e_slope = losses[0] * w_slope + losses[1] * slope
-    command_slope = 0.5 * w_slope + (1.0 - losses[7]) * lost_slope * e_slope
+    command_slope = 0.5 * w_slope + (1.0 - losses[8]) * lost_slope * e_slope
     value = m if what == _OUTPUT else (w if what == _FIELD else command)
     by_u = slope if what == _OUTPUT else (w_slope if what == _FIELD else command_slope)
     return value, by_u, m
@@ -386,7 +395,7 @@ def _advance(
     if fresh:
         memory[k + 3], e = w, 0.0
     lost = lost_field(e, losses)[0]
-    command = 0.5 * (w + memory[k + 3]) + losses[7] * memory[k + 2] + (1.0 - losses[7]) * lost
+    command = 0.5 * (w + memory[k + 3]) + losses[8] * memory[k + 2] + (1.0 - losses[8]) * lost
     memory[k + 2] = losses[2] * memory[k + 2] + (1.0 - losses[2]) * lost
     before = memory[k]
     _settle(u, memory, bank)

@@ -13,10 +13,11 @@ displacement.
 The command leads the field by the losses, in the mean over a sample::
 
     v = w + z,  z + tau_b z' = h(e),  e = tau_0 w' + tau_1 m(y)',
-    h(e) = e (1 + b |e| + c e^2 + x / sqrt(|e| + e_0))
+    h(e) = e (1 / (1 - g |e|) + b |e| + c e^2 + x / sqrt(|e| + e_0))
 
-with a flux m that rises with y. Memory, float64[4]: y, w and z, then the previous input; NaN means
-that there is none yet. It is updated in place, so any cut into blocks gives the same bits.
+with a flux m that rises with y. Before its pole, at g |e| = 0.9, the part with g continues along
+its tangent. Memory, float64[4]: y, w and z, then the previous input; NaN means that there is none
+yet. It is updated in place, so any cut into blocks gives the same bits.
 
 Sources: B. D. Coleman and M. L. Hodgdon, "A constitutive relation for rate-independent hysteresis
 in ferromagnetically soft materials", Int. J. Eng. Sci. 24 (1986) 897; J. Oh and D. S. Bernstein,
@@ -37,15 +38,16 @@ Band: TypeAlias = tuple[F64, F64, F64, F64]
 """Slopes float64[2, k, l], rising then falling, at k nodes of y and l across the band; longest step
 of y that begins in each cell, float64[2, k - 1, l - 1]; centre line and flux at these y, float64[2,
 k]; lowest y, distance of nodes of y, half the band's width b, distance of nodes across it."""
-Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float]
-"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, e_0, and the part that z before
-a sample has in its mean over the sample; the rest is h's."""
+Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
+"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, g, e_0, and the part that z
+before a sample has in its mean over the sample; the rest is h's."""
 
+_BEFORE_POLE = 0.9
 _STEPS = 100
 _MOST_STEPS = 1000  # of y in a sample; the rest of a jump goes by the slope that it begins with
 _NEAR_UM = 1e-9
 _BAND = "Tuple((float64[:, :, ::1], float64[:, :, ::1], float64[:, ::1], float64[::1]))"
-_LOSSES = "UniTuple(float64, 8)"
+_LOSSES = "UniTuple(float64, 9)"
 
 
 @kernel("int64(float64, float64)", inline=True)
@@ -182,12 +184,18 @@ def duhem_columns(
 @kernel(f"UniTuple(float64, 2)(float64, {_LOSSES})", inline=True)
 def _lost(e: float, losses: Losses) -> tuple[float, float]:
     """Return h(e) and its slope."""
+    growth, bend, excess, self_growth, even = losses[3:8]
     size = abs(e)
-    root = math.sqrt(size + losses[6])
-    more = losses[3] * size + losses[4] * size * size
-    slope = 1.0 + 2.0 * more + losses[4] * size * size
-    bend = losses[5] / root * (1.0 - 0.5 * size / (size + losses[6]))
-    return e * (1.0 + more + losses[5] / root), slope + bend
+    root = math.sqrt(size + even)
+    more = growth * size + bend * size * size
+    part = self_growth * size
+    near = min(part, _BEFORE_POLE)
+    grown = 1.0 / (1.0 - near)
+    slope = grown * grown + 2.0 * more + bend * size * size
+    slope += excess / root * (1.0 - 0.5 * size / (size + even))
+    if part > near:
+        grown *= grown * (part - near * near) / part
+    return e * (grown + more + excess / root), slope
 
 
 @kernel(f"UniTuple(float64, 4)(float64, float64[::1], {_BAND}, {_LOSSES})", inline=True)
@@ -200,8 +208,8 @@ def _moved(y: float, memory: F64, band: Band, losses: Losses) -> tuple[float, fl
     z = losses[2] * memory[2] + (1.0 - losses[2]) * lost
     i = _cell((y - grid[0]) / grid[1], lines.shape[1] - 1.0)
     e_by_y = losses[0] * by_y + losses[1] * (lines[1, i + 1] - lines[1, i]) / grid[1]
-    command = 0.5 * (w + memory[1]) + losses[7] * memory[2] + (1.0 - losses[7]) * lost
-    return w, z, command, 0.5 * by_y + (1.0 - losses[7]) * steeper * e_by_y
+    command = 0.5 * (w + memory[1]) + losses[8] * memory[2] + (1.0 - losses[8]) * lost
+    return w, z, command, 0.5 * by_y + (1.0 - losses[8]) * steeper * e_by_y
 
 
 @kernel(f"float64(float64, float64[::1], {_BAND}, {_LOSSES})")

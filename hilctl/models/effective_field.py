@@ -26,7 +26,9 @@ def even_excess(span: float) -> float:
 class FieldLosses(StrictModel):
     """Lead of a command over the field: v = w + z, z + decay_s z' = h(e).
 
-    e = field_s w' + output_s m', h(e) = e (1 + growth |e| + bend e^2 + excess / sqrt(|e| + e_0)).
+    e = field_s w' + output_s m', h(e) = e (1 / (1 - self_growth |e|) + growth |e| + bend e^2 +
+    excess / sqrt(|e| + e_0)); beyond self_growth |e| = 0.9 the first part continues along its
+    tangent.
 
     Attributes:
         field_s: In s; constant lag of the field.
@@ -36,6 +38,7 @@ class FieldLosses(StrictModel):
         growth: Per command unit.
         bend: Per command unit squared.
         excess: Square root of the command's unit; losses of domain walls in motion.
+        self_growth: Per command unit; relative growth of the lag with the loss itself.
     """
 
     field_s: Time = 0.0
@@ -44,6 +47,7 @@ class FieldLosses(StrictModel):
     growth: NotNegative = 0.0
     bend: NotNegative = 0.0
     excess: NotNegative = 0.0
+    self_growth: NotNegative = 0.0
 
     def sampled(self, sample_rate_hz: float, span: float) -> Losses:
         """Return the losses in the form of the kernels, for a span of effective fields.
@@ -59,6 +63,7 @@ class FieldLosses(StrictModel):
             self.growth,
             self.bend,
             self.excess,
+            self.self_growth,
             even_excess(span),
             (1.0 - left) * lags,
         )

@@ -21,9 +21,9 @@ class Stages:
     field: float = 0.1  # constant lag of the field
     output: float = 0.02  # loss proportional to the slope of the hysteresis, at its mean slope
     decay: float = 0.01  # delay of the losses
-    growth: float = 0.1  # linear growth of the losses with themselves
-    bend: float = 0.1  # quadratic growth
+    growth: float = 0.1  # linear growth of the losses
     excess: float = 0.01  # loss that grows with the square root
+    self_growth: float = 0.1  # growth of the lag with the loss itself
     radian: float = 0.1  # 1 / w of the structure
     damping: float = 0.2  # its damping ratio
     delay: float = 0.03  # transport delay
@@ -33,8 +33,8 @@ SHORTEST_S = 1e-9  # of lags
 
 NAMES = tuple(field.name for field in fields(Stages))
 LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0)
-HIGH = Stages(2.0, 2.0, 0.3, 10.0, 20.0, 0.5, 0.3, 2.0, 0.3)
-STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.05, 0.01, 0.02, 0.05, 0.01)
+HIGH = Stages(2.0, 2.0, 0.3, 10.0, 0.5, 10.0, 0.3, 2.0, 0.3)
+STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.01, 0.05, 0.02, 0.05, 0.01)
 """Bounds, and changes that have about the same effect."""
 
 
@@ -67,7 +67,7 @@ class Physical:
     def parameters(self, offset_um: float) -> dict[str, float]:
         """Return all stages by their published names, with the displacement at rest."""
         return {
-            **self.losses.model_dump(),
+            **self.losses.model_dump(exclude={"bend"}),
             **self.structure.model_dump(),
             "delay_s": self.delay_s,
             "output_offset_um": offset_um,
@@ -83,8 +83,8 @@ def physical(stages: Stages, data: Prepared) -> Physical:
         output_s=stages.output * unit_s * gain,
         decay_s=stages.decay * unit_s,
         growth=stages.growth / data.reach,
-        bend=stages.bend / data.reach**2,
         excess=stages.excess * math.sqrt(data.reach),
+        self_growth=stages.self_growth / data.reach,
     )
     return Physical(
         losses,
@@ -105,8 +105,8 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
         output=losses.output_s / (unit_s * gain),
         decay=losses.decay_s / unit_s,
         growth=losses.growth * data.reach,
-        bend=losses.bend * data.reach**2,
         excess=losses.excess / math.sqrt(data.reach),
+        self_growth=losses.self_growth * data.reach,
         radian=known.radian_s / unit_s,
         damping=known.damping_ratio,
         delay=known.delay_s / unit_s,

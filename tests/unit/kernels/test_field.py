@@ -30,8 +30,8 @@ BANK = (
     np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS]),
 )
 SPAN = (-12.0, 12.0, 1e-10)
-LOSSES = (3.0, 0.4, 0.6, 0.1, 0.02, 0.05, 0.01, -0.4 / math.log(0.6))
-NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+LOSSES = (3.0, 0.4, 0.6, 0.1, 0.02, 0.05, 0.2, 0.01, -0.4 / math.log(0.6))
+NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
 CURVE = (np.array([-50.0, 0.0, 50.0]), np.array([-40.0, 0.0, 60.0]))
 SAME = (np.array([0.0, 1.0]), np.array([0.0, 1.0]))
 LINE = (  # one play without a threshold, of slope 2
@@ -82,8 +82,12 @@ def operators(u):
 
 
 def h(e, losses):
-    _, _, _, b, c, x, e_0, _ = losses
-    return e * (1.0 + b * abs(e) + c * e**2 + x / math.sqrt(abs(e) + e_0))
+    _, _, _, b, c, x, g, e_0, _ = losses
+    size = abs(e)
+    near = min(g * size, 0.9)
+    grown = size if g == 0.0 else (near / (1.0 - near) + (g * size - near) / (1.0 - near) ** 2) / g
+    more = b * size + c * size**2 + x / math.sqrt(size + e_0)
+    return math.copysign(grown + size * more, e)
 
 
 def commands(w, m, losses):
@@ -91,7 +95,7 @@ def commands(w, m, losses):
     out, z = [w[0]], 0.0
     for k in range(1, w.size):
         e = losses[0] * (w[k] - w[k - 1]) + losses[1] * (m[k] - m[k - 1])
-        mean = losses[7] * z + (1.0 - losses[7]) * h(e, losses)
+        mean = losses[8] * z + (1.0 - losses[8]) * h(e, losses)
         z = losses[2] * z + (1.0 - losses[2]) * h(e, losses)
         out.append(0.5 * (w[k] + w[k - 1]) + mean)
     return np.array(out)
@@ -210,15 +214,15 @@ def test_a_line_through_points_goes_on_straight():
 
 
 def test_lost_field_by_hand():
-    losses = (0.0, 0.0, 0.0, 0.1, 0.02, 0.5, 0.25, 0.0)
-    assert lost_field(2.0, losses)[0] == pytest.approx(2.0 * (1.0 + 0.2 + 0.08 + 0.5 / 1.5))
+    losses = (0.0, 0.0, 0.0, 0.1, 0.02, 0.5, 0.3, 0.25, 0.0)
+    assert lost_field(2.0, losses)[0] == pytest.approx(2.0 * (2.5 + 0.2 + 0.08 + 0.5 / 1.5))
     assert lost_field(-2.0, losses) == (-lost_field(2.0, losses)[0], lost_field(2.0, losses)[1])
 
 
-@pytest.mark.parametrize("only", [3, 4, 5])
+@pytest.mark.parametrize("only", [3, 4, 5, 6])
 @pytest.mark.parametrize("e", [-3.0, -0.2, 0.0, 0.01, 0.4, 5.0])
 def test_the_slope_of_the_losses_is_their_derivative(only, e):
-    losses = (*(0.7 if i == only else 0.0 for i in range(6)), 0.25, 0.0)
+    losses = (*(0.7 if i == only else 0.0 for i in range(7)), 0.25, 0.0)
     rise = lost_field(e + 1e-5, losses)[0] - lost_field(e - 1e-5, losses)[0]
     assert lost_field(e, losses)[1] == pytest.approx(rise / 2e-5, rel=1e-4)
 

@@ -19,8 +19,8 @@ SLOPES = np.stack(
         for way in (1.0, -1.0)
     ]
 )
-NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-LOSSES = (3.0, 0.02, 0.6, 0.1, 0.02, 0.05, 0.01, 0.75)
+NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+LOSSES = (3.0, 0.02, 0.6, 0.1, 0.02, 0.05, 0.05, 0.01, 0.75)
 
 
 def band(slopes=SLOPES, step=math.inf):
@@ -113,12 +113,14 @@ def test_the_command_is_ahead_by_the_losses():
     ends = np.concatenate(([NODES[0] - 50.0], NODES, [NODES[-1] + 50.0]))
     last = (FLUX[-1] - FLUX[-2]) / (NODES[-1] - NODES[-2])
     flux = np.interp(y, ends, np.concatenate(([0.0], FLUX, [FLUX[-1] + 50.0 * last])))
-    field_pace, output_pace, left, growth, bend, excess, even, mean = LOSSES
+    field_pace, output_pace, left, growth, bend, excess, self_growth, even, mean = LOSSES
     z, expected = 0.0, [w[0]]
     for k in range(1, y.size):
         e = field_pace * (w[k] - w[k - 1]) + output_pace * (flux[k] - flux[k - 1])
         size = abs(e)
-        lost = e * (1.0 + growth * size + bend * size**2 + excess / math.sqrt(size + even))
+        assert self_growth * size < 0.9
+        lost = growth * size + bend * size**2 + excess / math.sqrt(size + even)
+        lost = e * (1.0 / (1.0 - self_growth * size) + lost)
         expected.append(0.5 * (w[k] + w[k - 1]) + mean * z + (1.0 - mean) * lost)
         z = left * z + (1.0 - left) * lost
     assert run(duhem_inverse, y, LOSSES) == pytest.approx(expected, abs=1e-9)

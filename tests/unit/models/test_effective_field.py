@@ -10,7 +10,15 @@ from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 
 RATE_HZ = 50_000.0
 CURVE = OutputCurve(operators_um=(-60.0, 0.0, 60.0), displacement_um=(-50.0, 0.0, 45.0))
-LOSSES = FieldLosses(field_s=1e-4, output_s=2e-6, decay_s=3e-5, growth=0.1, bend=0.02, excess=0.05)
+LOSSES = FieldLosses(
+    field_s=1e-4,
+    output_s=2e-6,
+    decay_s=3e-5,
+    growth=0.1,
+    bend=0.02,
+    excess=0.05,
+    self_growth=0.2,
+)
 
 
 def field_model(**changes):

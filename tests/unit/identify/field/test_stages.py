@@ -12,7 +12,7 @@ from hilctl.identify.field.preprocess import Prepared, Run
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 
 RATE_HZ = 20_000.0
-STAGES = stages.Stages(0.3, 0.2, 0.1, 0.4, 0.5, 0.06, 0.08, 0.9, 0.11)
+STAGES = stages.Stages(0.3, 0.2, 0.1, 0.4, 0.06, 0.5, 0.08, 0.9, 0.11)
 TIME_S = np.arange(2000) / RATE_HZ
 COMMAND = 4.0 * np.sin(2.0 * np.pi * 50.0 * TIME_S) + np.sin(2.0 * np.pi * 230.0 * TIME_S)
 
@@ -53,7 +53,7 @@ def test_units_by_hand():
     data.top_hz, data.reach, data.stroke_um = 50.0 / math.pi, 4.0, 16.0  # unit of time: 0.01 s
     known = stages.physical(STAGES, data)
     losses = FieldLosses(
-        field_s=0.003, output_s=0.001, decay_s=0.001, growth=0.1, bend=0.5 / 16.0, excess=0.12
+        field_s=0.003, output_s=0.001, decay_s=0.001, growth=0.1, excess=0.12, self_growth=0.125
     )
     assert known.losses.model_dump() == pytest.approx(losses.model_dump())
     linear = known.radian_s, known.damping_ratio, known.delay_s
@@ -85,7 +85,13 @@ def test_of_a_model_s_record_the_field_is_the_model_s(decay_s):
     """The model's operators give 2 u: so what its curve is undone to is twice the field."""
     operators, displacement_um = np.array([-40.0, 5.0, 40.0]), np.array([-20.0, 1.0, 50.0])
     losses = FieldLosses(
-        field_s=2e-4, output_s=3e-5, decay_s=decay_s, growth=0.2, bend=0.05, excess=0.3
+        field_s=2e-4,
+        output_s=3e-5,
+        decay_s=decay_s,
+        growth=0.2,
+        bend=0.05,
+        excess=0.3,
+        self_growth=0.1,
     )
     model = FieldModel(
         thresholds=(0.0,), lowest=-10.0, cell=20.0, slopes=((2.0,),),
