@@ -16,7 +16,7 @@ from hilctl.identify.staged.fit_data import GAMMA_S, PARAMETERS, SPACING, plays_
 from hilctl.kernels.hysteresis import play_outputs, play_sum_shared, rest_memory
 from hilctl.models.base import HysteresisModel
 from hilctl.models.integrated import ButterflyModel, IntegratedModel
-from hilctl.models.linear_stages import FurtherMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.models.plays import PlayModel
 
 PERIODS = 3
@@ -203,6 +203,10 @@ def ignore_progress(done: float, text: str) -> None:
     """Ignore a progress report."""
 
 
+Structure: TypeAlias = FirstMode | bool
+"""First mode of the structure: measured, to be identified (True), or none (False)."""
+
+
 @dataclass(frozen=True, slots=True)
 class FitRequest:
     """Records to fit, and settings."""
@@ -214,6 +218,7 @@ class FitRequest:
     run: MapFunction = serial_map
     progress: OnProgress = ignore_progress
     start: object | None = None  # start of the search, see :class:`FitJob`
+    structure: FirstMode | None = None  # measured first mode, near which histories are fitted
     modes: Sequence[FurtherMode] = ()  # known further modes, for kinds that have them
     validate: Sequence[Record] = ()  # held out if no part of the others can be
 
@@ -227,6 +232,7 @@ class FitJob:
     run: MapFunction = serial_map
     progress: OnProgress = ignore_progress
     start: object | None = None
+    structure: Structure = True
 
     @property
     def least(self) -> float:

@@ -184,7 +184,8 @@ def fit_kind(request: FitRequest) -> FoundModel:
     bare = records if creep is None else without_creep(records, creep)
     bare = without_modes(bare, modes) if modes else bare
     data = FitData(bare if settings.kind in EVERY_SAMPLE else thinned(bare), unit)
-    job = FitJob(data, settings, request.run, request.progress, request.start)
+    structure = settings.looks_for("structure") and (request.structure or True)
+    job = FitJob(data, settings, request.run, request.progress, request.start, structure)
     try:
         found = CATALOGUE[settings.kind].fit(job)
     except ValidationError as error:

@@ -219,6 +219,8 @@ def _suggestions(
         hint = ": fit it with --set offset=true" if offset else ""
         share = f"{-constant:.3g} µm, {shown:.1f} % of the stroke"
         yield f"most of the error is a constant, {share}{hint}"
+    if fit.at_bound:
+        yield f"at a bound, so not determined by the data: {', '.join(fit.at_bound)}"
     if stroke_um > LIKELY_UM:
         yield f"a stroke of {stroke_um:.3g} µm is large. Is the displacement in µm?"
 

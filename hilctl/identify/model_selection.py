@@ -338,7 +338,7 @@ def _candidates(
     names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
     request.progress(0.0, "; ".join(names))
     settings = [IdentifySettings(**each, **shared) for each in candidates]
-    parts = {"creep_stage": given.creep_stage, "modes": given.modes}
+    parts = {name: getattr(given, name) for name in ("creep_stage", "modes", "structure")}
     settings = [
         each.model_copy(update={name: on for name, on in parts.items() if each.has(name)})
         for each in settings

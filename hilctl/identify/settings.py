@@ -109,7 +109,7 @@ class FitSettings(StrictModel):
     lag: Literal["growth", "plain", "none"] = _of(
         ("staged",), "growth", "Field lag: growing with its distance, constant, or none."
     )
-    structure: bool = _of(("staged",), True, "Fit a second-order structure.")
+    structure: bool = _of(_STAGES, True, "Fit a second-order structure.")
     delay: bool = _of(("staged",), True, "Fit a transport delay.")
     turning_um: float | None = _of(
         ("butterfly",), None, "Displacement where the wings meet; the lowest one if not set."

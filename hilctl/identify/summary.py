@@ -52,9 +52,6 @@ def summary(found: Identification) -> list[str]:
         for each in found.candidates
     ]
     lines += [f"fitted: {_errors(fit)}", f"{ended}, in {fit.elapsed_s:.2f} s"]
-    if fit.at_bound:
-        shown = ", ".join(fit.at_bound)
-        lines.append(f"at a bound, so not determined by the data: {shown}")
     if known is not None:
         lines.append(
             f"identified for {_span(known.peak_to_peak_um)} µm peak-to-peak, "

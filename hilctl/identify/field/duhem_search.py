@@ -22,6 +22,7 @@ from hilctl.identify.field.stages import (
     STEP,
     Physical,
     Stages,
+    StageSpace,
     physical,
     row,
     signals,
@@ -29,7 +30,7 @@ from hilctl.identify.field.stages import (
     stages_of,
 )
 from hilctl.identify.field.stages import NAMES as STAGES
-from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress
+from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress, Structure
 from hilctl.identify.parallel import parallel_map
 from hilctl.kernels.generalised_duhem import Band, duhem_columns
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel, band_of
@@ -96,10 +97,6 @@ class Signals:
     def offset_in(self, offset_um: float, first_um: float) -> float:
         """Undo :meth:`offset_um`, clipped to the bounds."""
         return float(np.clip((offset_um - first_um) / self._half_um, -_OFFSET, _OFFSET))
-
-    def row_of(self, known: Physical, other: F64) -> F64:
-        """Return a row of stages, with flux and offset of another row."""
-        return np.concatenate((row(stages_of(known, self._data)), other[len(STAGES) :]))
 
     def choose(self, x: F64, way: float) -> None:
         """Choose the points of all paths, at most ``way`` of the command's span apart."""
@@ -263,13 +260,20 @@ class DuhemEnd:
     flux: Curve
     offset_um: float
     x: F64
+    at_bound: tuple[str, ...]
 
 
 class DuhemSearch:
     """Search of table and stages, with slopes of at least ``least`` um per command unit."""
 
-    def __init__(self, data: Prepared, cells: int, across: int, least: float) -> None:
-        self._stroke_um = data.stroke_um
+    def __init__(
+        self, data: Prepared, cells: int, across: int, least: float, structure: Structure = True
+    ) -> None:
+        self._data, self._stroke_um = data, data.stroke_um
+        self._space = StageSpace.of(data, structure)
+        self._low, self._high = LOWEST.copy(), HIGHEST.copy()
+        self._low[: len(STAGES)], self._high[: len(STAGES)] = self._space.low, self._space.high
+        self._first = np.clip(FIRST, self._low, self._high)
         self._signals = Signals(data)
         self._size = cells, across
         mean = np.log(data.stroke_um / (2.0 * data.reach))
@@ -277,7 +281,7 @@ class DuhemSearch:
 
     def find(self, progress: OnProgress) -> DuhemEnd:
         """Search with a coarse table, then with the requested size."""
-        x = FIRST.copy()
+        x = self._first.copy()
         paths = self._chosen(x, COARSE_WAY, COARSE_ROWS)
         self._lay(laid_over(paths, *COARSE))
         self._first_um = self._rest_um(paths[0])
@@ -294,7 +298,8 @@ class DuhemSearch:
 
     def go_on(self, end: DuhemEnd) -> DuhemEnd:
         """Return the end of a search from the end of one with another table or data."""
-        x = self._signals.row_of(end.known, end.x)
+        stages = self._space.within(stages_of(end.known, self._data))
+        x = np.concatenate((stages, end.x[len(STAGES) :]))
         path = self._chosen(x, COARSE_WAY, COARSE_ROWS)[0]
         self._layout = end.layout
         self._first_um = self._rest_um(path)
@@ -306,9 +311,9 @@ class DuhemSearch:
         self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_ROWS), *self._size))
         x, logs = self._descend(x, self._layout.moved(logs, before), STEPS_FINE, FINE_GAIN)
         offset_um = self._signals.offset_um(x, self._first_um)
-        return DuhemEnd(
-            self._signals.known(x), self._layout, logs, self._signals.flux(x), offset_um, x
-        )
+        known, flux = self._signals.known(x), self._signals.flux(x)
+        held = self._space.at_bound(stages_in(x[: len(STAGES)]))
+        return DuhemEnd(known, self._layout, logs, flux, offset_um, x, held)
 
     def _chosen(self, x: F64, way: float, rows: int) -> list[Path]:
         self._signals.choose(x, way)
@@ -341,7 +346,7 @@ class DuhemSearch:
             normal, down = self._normal(x, logs, errors, stages=stages)
             first = damping
             for _ in range(TRIALS):
-                step = _bounded_step(normal, down, damping, logs.size, x)
+                step = _bounded_step(normal, down, damping, logs.size, x, (self._low, self._high))
                 if step is not None:
                     to_x, to_logs = self._stepped(x, logs, step)
                     to_errors = self._errors(to_x, to_logs)
@@ -362,11 +367,11 @@ class DuhemSearch:
     def _stepped(self, x: F64, logs: F64, step: F64) -> tuple[F64, F64]:
         table = logs + np.clip(step[: logs.size], -1.0, 1.0).reshape(logs.shape)
         stages = x + step[logs.size :] * STEPS if step.size > logs.size else x
-        return np.clip(stages, LOWEST, HIGHEST), np.clip(table, *self._log_range)
+        return np.clip(stages, self._low, self._high), np.clip(table, *self._log_range)
 
     def _cost(self, x: F64, logs: F64, errors: F64) -> float:
         held = logs.ravel() @ self._prior @ logs.ravel()
-        return float(errors @ errors + held + HELD**2 * np.sum(((x - FIRST) / STEPS) ** 2))
+        return float(errors @ errors + held + HELD**2 * np.sum(((x - self._first) / STEPS) ** 2))
 
     def _normal(self, x: F64, logs: F64, errors: F64, *, stages: bool) -> tuple[F64, F64]:
         """Return the normal equations of a step (table first, then stages)."""
@@ -376,7 +381,7 @@ class DuhemSearch:
         for k in reversed(range(size, slopes.shape[1])):  # the offset first: paths are still cached
             there, stage = x.copy(), k - size
             step = DIFFERENCE * STEPS[stage]
-            there[stage] += step if x[stage] + step <= HIGHEST[stage] else -step
+            there[stage] += step if x[stage] + step <= self._high[stage] else -step
             change = self._errors(there, logs) - errors
             slopes[:, k] = change * (STEPS[stage] / (there[stage] - x[stage]))
         normal, down = slopes.T @ slopes, -(slopes.T @ errors)
@@ -384,7 +389,7 @@ class DuhemSearch:
         down[:size] -= self._prior @ logs.ravel()
         if stages:
             normal[range(size, len(normal)), range(size, len(normal))] += HELD**2
-            down[size:] -= HELD**2 * (x - FIRST) / STEPS
+            down[size:] -= HELD**2 * (x - self._first) / STEPS
         return normal, down
 
     def _errors(self, x: F64, logs: F64, slopes: F64 | None = None) -> F64:
@@ -416,7 +421,9 @@ class DuhemSearch:
         return errors
 
 
-def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) -> F64 | None:
+def _bounded_step(
+    normal: F64, down: F64, damping: float, table: int, x: F64, bounds: tuple[F64, F64]
+) -> F64 | None:
     """Return the step of damped equations, with stages limited to their bounds, or None."""
     # None if the damping is too small: rounding of large errors may exceed the prior.
     damped = normal.copy()
@@ -428,10 +435,11 @@ def _bounded_step(normal: F64, down: F64, damping: float, table: int, x: F64) ->
     if step.size == table:
         return step
     wanted = x + step[table:] * STEPS
-    held = table + np.flatnonzero((wanted < LOWEST) | (wanted > HIGHEST))
+    low, high = bounds
+    held = table + np.flatnonzero((wanted < low) | (wanted > high))
     if held.size:
         fixed = np.zeros(step.size)
-        fixed[held] = ((np.clip(wanted, LOWEST, HIGHEST) - x) / STEPS)[held - table]
+        fixed[held] = ((np.clip(wanted, low, high) - x) / STEPS)[held - table]
         free = np.setdiff1d(np.arange(step.size), held)
         rest = (down - damped @ fixed)[free]
         step = fixed
@@ -446,14 +454,14 @@ def fit_generalised_duhem(job: FitJob) -> FoundModel:
     """Fit a table of slopes, losses, structure and delay; raise DataError for loops."""
     data = Prepared(histories_of(job.data.records, "a table of slopes"), POINTS, OFF)
     settings = job.settings
-    search = DuhemSearch(data, settings.cells, settings.across, job.least)
+    search = DuhemSearch(data, settings.cells, settings.across, job.least, job.structure)
     if isinstance(job.start, DuhemEnd):
         found = search.go_on(job.start)
     else:
         found = search.find(job.progress)
     parameters = found.known.parameters(found.offset_um)
     numbers = found.logs.size + len(NAMES)
-    return FoundModel(_model(job, found), numbers, parameters, end=found)
+    return FoundModel(_model(job, found), numbers, parameters, at_bound=found.at_bound, end=found)
 
 
 def _model(job: FitJob, found: DuhemEnd) -> StagedModel:

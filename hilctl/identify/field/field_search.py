@@ -11,18 +11,18 @@ from hilctl.identify.field.design_matrix import chosen
 from hilctl.identify.field.preprocess import Prepared, histories_of
 from hilctl.identify.field.stages import (
     HIGH,
-    LOW,
     NAMES,
     STEP,
     Physical,
     Stages,
+    StageSpace,
     physical,
     row,
     signals,
     stages_in,
     stages_of,
 )
-from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress
+from hilctl.identify.fit_api import FitJob, FoundModel, OnProgress, Structure
 from hilctl.identify.least_squares import SearchPoint, settle
 from hilctl.identify.parallel import parallel_map
 from hilctl.models.effective_field import FieldModel, OutputCurve
@@ -47,9 +47,15 @@ class JointRefinement:
     """Minimisation of a sum of squares over stages and the thresholds of a grid."""
 
     def __init__(
-        self, rows_of: Callable[[F64], BareSignal], paths: Sequence[I64], grid: Grid, least: float
+        self,
+        rows_of: Callable[[F64], BareSignal],
+        paths: Sequence[I64],
+        grid: Grid,
+        least: float,
+        space: StageSpace,
     ) -> None:
         self._rows_of, self._paths, self._grid, self._least = rows_of, paths, grid, least
+        self._space = space
         self._tried: tuple[F64, Equations, BareSignal] | None = None
 
     def follow(self, stages: F64) -> tuple[F64, Grid]:
@@ -59,8 +65,8 @@ class JointRefinement:
         above = np.append(below[1:], below[-1:])
         unit = np.concatenate((row(STEP), MOVES * below))
         # Thresholds move less than half of their distance, so that they stay in order.
-        low = np.concatenate((row(LOW), first - ROOM * below))
-        high = np.concatenate((row(HIGH), first + ROOM * above))
+        low = np.concatenate((self._space.low, first - ROOM * below))
+        high = np.concatenate((self._space.high, first + ROOM * above))
         x = settle(
             lambda point: self._equations(point)[0].solve().squares,
             lambda point: self._place(point, unit, high),
@@ -89,6 +95,9 @@ class JointRefinement:
         given, changes[:, STAGES:] = outputs(rows.fields, self._paths, grid, found.slopes)
         here = found.errors_of(given, rows.y)
         for i in range(STAGES):
+            if self._space.low[i] == self._space.high[i]:
+                changes[:, i] = 0.0
+                continue
             there = x.copy()
             there[i] += TRIED * unit[i] if x[i] + TRIED * unit[i] <= high[i] else -TRIED * unit[i]
             moved = self._rows_of(there[:STAGES])
@@ -133,6 +142,7 @@ class FieldEnd:
     weights: Weights
     met: Curve | None  # the curve that the losses depend on, by displacement with its offset
     widest: float  # largest useful threshold, of half the span
+    at_bound: tuple[str, ...]
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,17 +159,21 @@ class _Descent:
 class FieldSearch:
     """Search of weights and stages of one size of model; ``least`` is in um per command unit."""
 
-    def __init__(self, data: Prepared, size: Size, least: float) -> None:
+    def __init__(
+        self, data: Prepared, size: Size, least: float, structure: Structure = True
+    ) -> None:
         self._data, self._size, self._least = data, size, least
+        self._space, self._measured = StageSpace.of(data, structure), structure is not True
         self._choose(SEARCH_ROWS)
         self._curve: Curve | None = None
         self._grid: Grid | None = None
         self._widest = 1.0
 
-    def find(self, first: Stages, progress: OnProgress) -> FieldEnd:
+    def find(self, progress: OnProgress) -> FieldEnd:
         """Return the end of the best start, with all weights."""
+        first = stages_in(self._space.within(Stages()))
         found = self._descended(first, progress, 0.0)
-        if found.stages.radian > NEAR_BOUND * HIGH.radian:
+        if not self._measured and found.stages.radian > NEAR_BOUND * HIGH.radian:
             # Slow records determine the structure poorly: a soft one may replace hysteresis.
             for k, radian in enumerate(STIFFER, start=1):
                 start = replace(first, radian=radian, delay=0.3 * radian)
@@ -171,7 +185,7 @@ class FieldSearch:
     def go_on(self, end: FieldEnd) -> FieldEnd:
         """Return the end of a search from the end of one with other operators or data."""
         self._curve, self._grid, self._widest = end.met, end.grid, end.widest
-        return self._end(row(stages_of(end.known, self._data)), end.grid)
+        return self._end(self._space.within(stages_of(end.known, self._data)), end.grid)
 
     def _descended(self, first: Stages, progress: OnProgress, done: float) -> "_Descent":
         """Return the descent from the best of some starts."""
@@ -205,7 +219,7 @@ class FieldSearch:
     def _polish(self, x: F64) -> tuple[F64, Grid]:
         """Return better stages and thresholds."""
         samples, grid = self._rows.samples, self._laid()
-        return JointRefinement(self._bare, samples, grid, self._least).follow(x)
+        return JointRefinement(self._bare, samples, grid, self._least, self._space).follow(x)
 
     def _error(self, x: F64) -> float:
         """Return the weighted rms error of the displacement, in um."""
@@ -287,8 +301,8 @@ class FieldSearch:
         self._learn(x)
         self._choose(FINAL_ROWS)
         found = self._solved(x)
-        known = physical(stages_in(x), self._data)
-        return FieldEnd(known, self._laid(), found, self._curve, self._widest)
+        known, held = physical(stages_in(x), self._data), self._space.at_bound(stages_in(x))
+        return FieldEnd(known, self._laid(), found, self._curve, self._widest, held)
 
 
 def _lengths(count: int) -> F64:
@@ -307,14 +321,14 @@ def fit_field(job: FitJob) -> FoundModel:
     settings = job.settings
     data = Prepared(histories_of(job.data.records, "an effective field"))
     size = Size(settings.plays, settings.drags, settings.cells, settings.knots)
-    search = FieldSearch(data, size, job.least)
+    search = FieldSearch(data, size, job.least, job.structure)
     if isinstance(job.start, FieldEnd):
         found = search.go_on(job.start)
     else:
-        found = search.find(Stages(), job.progress)
+        found = search.find(job.progress)
     known = found.known.parameters(found.weights.offset_um)
     numbers = len(known) + int((found.weights.slopes > 0.0).sum()) + settings.knots
-    return FoundModel(_model(job, found), numbers, known, end=found)
+    return FoundModel(_model(job, found), numbers, known, at_bound=found.at_bound, end=found)
 
 
 def _model(job: FitJob, found: FieldEnd) -> StagedModel:

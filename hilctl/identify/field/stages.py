@@ -1,14 +1,15 @@
 """Losses, structure and delay of a fit to histories: search variables and physical values."""
 
 import math
-from dataclasses import dataclass, fields
-from typing import Any
+from dataclasses import dataclass, fields, replace
+from typing import Any, Self
 
 import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.identify.field.densities import Curve
 from hilctl.identify.field.preprocess import Prepared, Run
+from hilctl.identify.fit_api import Structure
 from hilctl.kernels.field import field_left
 from hilctl.models.effective_field import FieldLosses, even_excess
 from hilctl.models.linear_stages import FirstMode
@@ -32,6 +33,11 @@ class Stages:
 SHORTEST_S = 1e-9  # of lags
 
 NAMES = tuple(field.name for field in fields(Stages))
+PARAMETERS = (
+    "field_s", "output_s", "decay_s", "growth", "excess", "self_growth",
+    "natural_hz", "damping_ratio", "delay_s",
+)  # fmt: skip
+"""Published names, in the same order."""
 LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0)
 HIGH = Stages(2.0, 2.0, 0.3, 10.0, 0.5, 10.0, 0.3, 2.0, 0.3)
 STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.01, 0.05, 0.02, 0.05, 0.01)
@@ -59,19 +65,20 @@ class Physical:
     lag_s: float
 
     @property
-    def structure(self) -> FirstMode:
-        """The structure as a stage of a model."""
+    def structure(self) -> FirstMode | None:
+        """The structure as a stage of a model; None for a rigid one."""
+        if not self.radian_s > 0.0:
+            return None
         natural_hz = 0.5 / (math.pi * self.radian_s)
         return FirstMode(natural_hz=natural_hz, damping_ratio=self.damping_ratio)
 
     def parameters(self, offset_um: float) -> dict[str, float]:
         """Return all stages by their published names, with the displacement at rest."""
-        return {
-            **self.losses.model_dump(exclude={"bend"}),
-            **self.structure.model_dump(),
-            "delay_s": self.delay_s,
-            "output_offset_um": offset_um,
-        }
+        named = self.losses.model_dump()
+        named |= self.structure.model_dump() if self.structure else {}
+        named |= {"delay_s": self.delay_s}
+        known = {name: named[name] for name in PARAMETERS if name in named}
+        return {**known, "output_offset_um": offset_um}
 
 
 def physical(stages: Stages, data: Prepared) -> Physical:
@@ -96,11 +103,11 @@ def physical(stages: Stages, data: Prepared) -> Physical:
 
 
 def stages_of(known: Physical, data: Prepared) -> Stages:
-    """Undo :func:`physical`, for the same or other records; clipped to the bounds."""
+    """Undo :func:`physical`, for the same or other records."""
     unit_s = 1.0 / (2.0 * math.pi * data.top_hz)
     gain = 2.0 * data.reach / data.stroke_um
     losses = known.losses
-    found = Stages(
+    return Stages(
         field=losses.field_s / unit_s,
         output=losses.output_s / (unit_s * gain),
         decay=losses.decay_s / unit_s,
@@ -111,7 +118,42 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
         damping=known.damping_ratio,
         delay=known.delay_s / unit_s,
     )
-    return stages_in(np.clip(row(found), row(LOW), row(HIGH)))
+
+
+SURE_HZ, SURE_DAMPING = 1.1, 1.5
+"""Factors within which a measured structure is searched."""
+AT_BOUND = 1e-4  # of a range: distance to a bound that counts as at the bound
+
+
+@dataclass(frozen=True, slots=True)
+class StageSpace:
+    """Bounds of a search, float64[9] each."""
+
+    low: F64
+    high: F64
+
+    @classmethod
+    def of(cls, data: Prepared, structure: Structure) -> Self:
+        """Return the space for a measured structure, an unknown one (True), or none (False)."""
+        low, high = LOW, HIGH
+        if structure is False:
+            low, high = (replace(each, radian=0.0, damping=0.0) for each in (low, high))
+        elif structure is not True:
+            radian, damping = data.top_hz / structure.natural_hz, structure.damping_ratio
+            low = replace(low, radian=radian / SURE_HZ, damping=damping / SURE_DAMPING)
+            high = replace(high, radian=radian * SURE_HZ, damping=damping * SURE_DAMPING)
+        return cls(row(low), row(high))
+
+    def within(self, stages: Stages) -> F64:
+        """Return stages within the bounds."""
+        return np.clip(row(stages), self.low, self.high)
+
+    def at_bound(self, stages: Stages) -> tuple[str, ...]:
+        """Return the published names of what is at a bound; a loss of 0 is none that is missing."""
+        x, room = row(stages), AT_BOUND * (self.high - self.low)
+        held = (x >= self.high - room) | ((x <= self.low + room) & (self.low > 0.0))
+        held &= self.high > self.low
+        return tuple(name for name, bound in zip(PARAMETERS, held, strict=True) if bound)
 
 
 def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tuple[F64, F64]:

@@ -13,6 +13,7 @@ from hilctl.base.errors import DataError, RunError
 from hilctl.base.types import C128, F64, I64
 from hilctl.identify.data.data_files import without_gaps
 from hilctl.ilc.cycle import coefficients
+from hilctl.models.linear_stages import FirstMode
 from hilctl.recording.recording import Recording
 
 ProblemCode: TypeAlias = Literal[
@@ -181,6 +182,13 @@ class SmallSignal:
     damping_ratio: float | None  # its damping ratio; None without a resonance
     misfit_percent: float  # rms residual of the fit, of the gain
     fitted: C128  # complex128[k], the fitted response
+
+    @property
+    def structure(self) -> FirstMode | None:
+        """The resonance as a stage of a model; None without one."""
+        if self.natural_hz is None or self.damping_ratio is None:
+            return None
+        return FirstMode(natural_hz=self.natural_hz, damping_ratio=self.damping_ratio)
 
     def size_at(self, frequency_hz: float) -> float:
         """Return the fitted magnitude at a frequency, over that at the lowest line."""

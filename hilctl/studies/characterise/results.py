@@ -181,16 +181,20 @@ VALIDATED: Mapping[str, str] = {
 """Steps for validation only, with their labels, the most important first."""
 
 
-def identified(recordings: Mapping[str, Path]) -> Identification:
+def identified(recordings: Mapping[str, Path], small: SmallSignal | None) -> Identification:
     """Identify a model from complete histories; raise InputError if none can be identified."""
     # Small loops depend on the history of the actuator, which steady loops do not contain.
     fitted = parallel_map(read, [p for name, p in recordings.items() if name in FITTED])
+    # The loops are too slow to determine the structure, which the small-signal response shows.
+    structure = small.structure if small else None
+    rigid = small is not None and structure is None
     with workers("threads") as run:
         return identify_records(
             FitRequest(
                 [_history(recording) for recording in fitted],
-                settings_from("auto", []),
+                settings_from("auto", ["structure=false"] if rigid else []),
                 fitted[0].command_unit,
+                structure=structure,
                 source=[recording.path.name for recording in fitted],
                 run=run,
             )

@@ -1,6 +1,7 @@
 """Tables of slopes and stages: layout, prior, signals and search."""
 
 from functools import cache
+from typing import Any
 
 import numpy as np
 import pytest
@@ -228,7 +229,7 @@ def test_stages_stay_within_their_bounds_and_the_others_make_up_for_it():
     wanted = np.zeros(len(NAMES))
     wanted[0] = 10.0 * (LOWEST - FIRST)[0] / STEPS[0]
     down[5] += 1e4 * wanted[0]
-    step = _bounded_step(normal, down, 0.0, 5, FIRST)
+    step = _bounded_step(normal, down, 0.0, 5, FIRST, (LOWEST, HIGHEST))
     at = FIRST + step[5:] * STEPS
     assert at[0] == pytest.approx(LOWEST[0])
     held = np.isclose(at, LOWEST) | np.isclose(at, HIGHEST)
@@ -240,8 +241,8 @@ def test_errors_beyond_what_holds_the_table_ask_for_more_damping():
     """As they do on a rig of two low modes, where no step could be worked out."""
     root = 1e4 * np.random.default_rng(3).standard_normal((2, 5))
     normal, down = root.T @ root, np.ones(5)
-    assert _bounded_step(normal - 1e-3 * np.eye(5), down, 1e-9, 5, FIRST) is None
-    step = _bounded_step(normal - 1e-3 * np.eye(5), down, 1.0, 5, FIRST)
+    assert _bounded_step(normal - 1e-3 * np.eye(5), down, 1e-9, 5, FIRST, (LOWEST, HIGHEST)) is None
+    step = _bounded_step(normal - 1e-3 * np.eye(5), down, 1.0, 5, FIRST, (LOWEST, HIGHEST))
     assert step is not None
     assert np.isfinite(step).all()
 
@@ -250,9 +251,9 @@ def test_a_descent_goes_on_where_the_first_damping_is_too_little(monkeypatch):
     job, logs = ready()
     dampings: list[float] = []
 
-    def refusing(normal: F64, down: F64, damping: float, table: int, x: F64) -> F64 | None:
+    def refusing(normal: F64, down: F64, damping: float, *others: Any) -> F64 | None:
         dampings.append(damping)
-        return None if len(dampings) == 1 else _bounded_step(normal, down, damping, table, x)
+        return None if len(dampings) == 1 else _bounded_step(normal, down, damping, *others)
 
     monkeypatch.setattr("hilctl.identify.field.duhem_search._bounded_step", refusing)
     x, better = job._descend(FIRST, logs, 2, 0.0)

@@ -22,7 +22,7 @@ from hilctl.identify.field.field_search import (
     Size,
 )
 from hilctl.identify.field.preprocess import Prepared
-from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages, row
+from hilctl.identify.field.stages import HIGH, LOW, STEP, Stages, StageSpace, row
 from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
@@ -65,7 +65,7 @@ def data(unit: float = 1.0, um: float = 1.0, ignore: int = 50) -> Prepared:
 
 @cache
 def found(unit: float = 1.0, um: float = 1.0) -> FieldEnd:
-    return FieldSearch(data(unit, um), SIZE, LEAST * um / unit).find(Stages(), lambda *_: None)
+    return FieldSearch(data(unit, um), SIZE, LEAST * um / unit).find(lambda *_: None)
 
 
 def laid(size: Size = SIZE) -> FieldSearch:
@@ -105,9 +105,7 @@ def test_units_make_no_difference():
 
 def test_progress_rises_below_1_and_names_each_round():
     seen: list[tuple[float, str]] = []
-    FieldSearch(data(), Size(2, 0, 3, 3), LEAST).find(
-        Stages(), lambda part, what: seen.append((part, what))
-    )
+    FieldSearch(data(), Size(2, 0, 3, 3), LEAST).find(lambda part, what: seen.append((part, what)))
     parts = [part for part, _ in seen]
     assert parts == sorted(set(parts))
     assert 0.0 < parts[0] <= parts[-1] < 1.0
@@ -167,6 +165,7 @@ def path(gain: float = 1.0) -> F64:
 
 
 KEPT = [np.arange(900)]
+SPACE = StageSpace(row(LOW), row(HIGH))
 
 
 def displacement_um() -> F64:
@@ -178,7 +177,7 @@ def displacement_um() -> F64:
 def followed(y: F64) -> tuple[F64, Grid]:
     """Return stages and operators at the minimum, for a path that no stage changes."""
     bare = BareSignal([path()], y, np.ones(y.size))
-    return JointRefinement(lambda _: bare, KEPT, GRID, LEAST).follow(row(Stages()))
+    return JointRefinement(lambda _: bare, KEPT, GRID, LEAST, SPACE).follow(row(Stages()))
 
 
 def test_a_threshold_goes_to_where_the_rods_yield():
@@ -206,7 +205,7 @@ def test_a_stage_is_found_with_the_weights_free():
         bent = path() + 0.4 * (stages[0] - 0.16) / row(STEP)[0] * np.sin(np.arange(900) / 40.0)
         return BareSignal([np.ascontiguousarray(bent)], y, np.ones(y.size))
 
-    x, _ = JointRefinement(rows_of, KEPT, GRID, LEAST).follow(first)
+    x, _ = JointRefinement(rows_of, KEPT, GRID, LEAST, SPACE).follow(first)
     assert x[0] == pytest.approx(0.16, abs=0.002)
     assert (x >= row(LOW)).all()
     assert (x <= row(HIGH)).all()

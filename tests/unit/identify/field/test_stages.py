@@ -10,6 +10,7 @@ from hilctl.identify.field import stages
 from hilctl.identify.field.densities import Curve
 from hilctl.identify.field.preprocess import Prepared, Run
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
+from hilctl.models.linear_stages import FirstMode
 
 RATE_HZ = 20_000.0
 STAGES = stages.Stages(0.3, 0.2, 0.1, 0.4, 0.06, 0.5, 0.08, 0.9, 0.11)
@@ -64,7 +65,29 @@ def test_units_by_hand():
 def test_stages_of_other_records_lie_within_the_bounds():
     known = stages.physical(stages.HIGH, Prepared([history()]))
     faster = Prepared([history(rate=5.0)])
-    assert stages.stages_of(known, faster).radian == stages.HIGH.radian
+    x = stages.StageSpace.of(faster, True).within(stages.stages_of(known, faster))
+    assert stages.stages_in(x).radian == stages.HIGH.radian
+
+
+def test_a_measured_structure_is_searched_nearby():
+    measured, data = FirstMode(natural_hz=300.0, damping_ratio=0.1), Prepared([history()])
+    space = stages.StageSpace.of(data, measured)
+    low, high = (stages.physical(stages.stages_in(x), data) for x in (space.high, space.low))
+    assert low.structure is not None
+    assert high.structure is not None
+    assert 250.0 < low.structure.natural_hz < 300.0 < high.structure.natural_hz < 350.0
+    assert low.structure.damping_ratio > 0.1 > high.structure.damping_ratio
+    assert space.at_bound(stages.stages_in(space.high))[-3:-1] == ("natural_hz", "damping_ratio")
+
+
+def test_without_a_structure_none_is_searched_nor_named():
+    data = Prepared([history()])
+    space = stages.StageSpace.of(data, False)
+    known = stages.physical(stages.stages_in(space.within(stages.Stages())), data)
+    assert known.structure is None
+    assert "natural_hz" not in known.parameters(0.0)
+    assert space.at_bound(stages.stages_in(space.low)) == ()
+    assert "natural_hz" not in space.at_bound(stages.stages_in(space.high))
 
 
 @pytest.mark.parametrize("units", [(3.0, 1.0, 1.0), (1.0, 0.2, 1.0), (1.0, 1.0, 5.0)])

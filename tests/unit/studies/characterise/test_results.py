@@ -3,6 +3,7 @@
 import json
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.model_quality import Verdict
 from hilctl.identify.pipeline import identify_records
 from hilctl.identify.settings import FitSettings
+from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PpiModel
 from hilctl.studies.characterise import results
 from hilctl.studies.characterise.loops import LoopFigures, ReversalCurves
@@ -152,8 +154,11 @@ def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkey
     monkeypatch.setattr(results, "identify_records", identify)
     monkeypatch.setattr(results, "read", lambda path: run())
     paths = {name: Path(f"{name}.mcap") for name in [*FITTED, *VALIDATED, "growing-1"]}
-    assert results.identified(paths) == "found"
+    small = SimpleNamespace(structure=FirstMode(natural_hz=900.0, damping_ratio=0.1))
+    assert results.identified(paths, small) == "found"
     (request,) = asked
+    assert request.structure == small.structure
+    assert request.settings.structure
     records, settings, unit = request.records, request.settings, request.unit
     assert len(records) == len(request.source) == len(FITTED)
     assert (settings.auto, settings.whole, unit) == (True, True, "A")
@@ -163,5 +168,6 @@ def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkey
     ends = [np.argmin(run().samples.command[:500]), np.argmax(run().samples.command[:500])]
     assert all(record.ignore == max(ends) for record in records)
     monkeypatch.setattr(results, "read", lambda path: run(rest=-1.0))
-    results.identified(paths)
+    results.identified(paths, SimpleNamespace(structure=None))
+    assert not asked[-1].settings.structure
     assert all(record.ignore == 0 for record in asked[-1].records)
