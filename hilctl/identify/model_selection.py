@@ -247,7 +247,10 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
         chains = [(IN_FULL.get(each.settings.kind, ())[turn:], each) for each in near]
         larger = [(chain[0], each) for chain, each in chains if chain]
         starts = [each.held_out.end for _, each in larger]
-        found = _candidates(request, given, [more for more, _ in larger], starts)
+        kinds = [more for more, _ in larger]
+        found = _candidates(request, given, kinds, starts)
+        if not any(each.rms_percent < WELL_PERCENT for each in found):
+            found += _candidates(request, given, kinds)  # the small model may have misled them
         errors += found
         better = [x for x in found if x.stroke_percent < WORTH * best.stroke_percent]
         best = min(better, key=lambda tried: tried.stroke_percent, default=best)

@@ -151,6 +151,14 @@ def test_the_kind_whose_small_model_does_well_is_tried_in_full(monkeypatch):
     assert held_out.end == "end of field 3 32"
 
 
+def test_full_models_with_a_large_error_are_tried_from_the_data_too(monkeypatch):
+    large = {name: 10.0 * error for name, error in SMALL.items()}
+    large |= {"generalised_duhem 12": 20.0, "integrated": 30.0}
+    seen = fake(monkeypatch, large)
+    chosen([HISTORY])
+    assert [start for name, start in seen if name == "field 3 32"] == ["end of field 0 32", None]
+
+
 def test_more_operators_are_taken_only_where_they_are_worth_it(monkeypatch):
     fake(monkeypatch, {**SMALL, "generalised_duhem 12": 0.7, "field 3 32": 0.99 * 0.15})
     settings, _ = chosen([HISTORY])
