@@ -180,7 +180,8 @@ def fit_kind(request: FitRequest) -> FoundModel:
     """Fit a kind of model to records without creep and known modes, which become its parts."""
     records, settings, unit = request.records, request.settings, request.unit
     modes = request.modes if settings.looks_for("modes") else ()
-    creep = creep_of(records) if settings.looks_for("creep_stage") else None
+    linear = settings.looks_for("creep_stage") and not settings.looks_for("activation")
+    creep = creep_of(records) if linear else None
     bare = records if creep is None else without_creep(records, creep)
     bare = without_modes(bare, modes) if modes else bare
     data = FitData(bare if settings.kind in EVERY_SAMPLE else thinned(bare), unit)

@@ -16,7 +16,7 @@ from hilctl.base.types import F64
 from hilctl.identify.data.records import History, Record, Records, SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge, judgement_of
 from hilctl.identify.fit_api import FitData, FitRequest, OnProgress, ignore_progress
-from hilctl.identify.fit_model import fit_kind, fit_model
+from hilctl.identify.fit_model import creep_of, fit_kind, fit_model
 from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import FitSettings, IdentifySettings
 
@@ -173,10 +173,12 @@ WHOLE: tuple[Mapping[str, Any], ...] = (
     {"kind": "generalised_duhem", "cells": 12, "across": 8},
 )
 """Candidates for histories: a small model of each kind, which is identified quickly."""
+CREEPING: Mapping[str, Any] = {**WHOLE[0], "activation": True}
+"""Further candidate for histories whose rests show creep."""
 PLAIN: Mapping[str, Any] = {"kind": "integrated", "offset": True}
 """Further candidate for histories if the error of all others is large."""
 WELL_PERCENT = 0.4  # mean error by stroke that small models of the right kind reach
-IN_FULL: Mapping[str, tuple[Mapping[str, Any], ...]] = {
+IN_FULL: Mapping[str, tuple[dict[str, Any], ...]] = {
     "field": ({"kind": "field", "drags": 0}, {"kind": "field"}),
     "generalised_duhem": ({"kind": "generalised_duhem"},),
 }
@@ -236,7 +238,9 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
     """Return the kind with the least error."""
     # Small models select the kinds to try at full size: a wrong kind is far off at any size.
     whole = any(isinstance(record, History) for record in request.records)
-    errors = _candidates(request, given, WHOLE if whole else LOOPS)
+    creeps = given.creep_stage and creep_of(request.records) is not None
+    histories = (*WHOLE, CREEPING) if creeps else WHOLE
+    errors = _candidates(request, given, histories if whole else LOOPS)
     if whole and not any(each.stroke_percent < WELL_PERCENT for each in errors):
         errors += _candidates(request, given, (PLAIN,))
     if not errors:
@@ -245,11 +249,11 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
     near = [each for each in errors if each.stroke_percent <= NEAR * best.stroke_percent]
     for turn in range(LONGEST if whole else 0):
         chains = [(IN_FULL.get(each.settings.kind, ())[turn:], each) for each in near]
-        larger = [(chain[0], each) for chain, each in chains if chain]
+        larger = [(chain[0] | _activation(each), each) for chain, each in chains if chain]
         starts = [each.held_out.end for _, each in larger]
         kinds = [more for more, _ in larger]
         found = _candidates(request, given, kinds, starts)
-        if not any(each.rms_percent < WELL_PERCENT for each in found):
+        if not any(each.stroke_percent < WELL_PERCENT for each in found):
             found += _candidates(request, given, kinds)  # the small model may have misled them
         errors += found
         better = [x for x in found if x.stroke_percent < WORTH * best.stroke_percent]
@@ -271,6 +275,12 @@ def _undivided(records: Sequence[Record]) -> str:
         f"from {cut_s:.4g} s, '{record.label}' moves further or faster than before, or hardly. "
         "Add a file of other motions with --validate, or set --model field"
     )
+
+
+def _activation(tried: "_Tried") -> dict[str, Any]:
+    """Return the settings of plays that creep, for a larger model of the same kind."""
+    # Each of them costs as much per sample as eight that do not.
+    return {"activation": True, "plays": 16} if tried.settings.looks_for("activation") else {}
 
 
 def _choose_order(request: FitRequest) -> Selection:

@@ -84,6 +84,7 @@ class FitSettings(StrictModel):
     across: int = _of(
         ("generalised_duhem",), 20, "Cells of a table of slopes across its band.", ge=2, le=60
     )
+    activation: bool = _of(("field",), False, "Plays creep with the logarithm of time.")
     knots: int = _of(("field",), 24, "Pieces of the output curve.", ge=2, le=60)
     size: Literal["given", "auto"] = _of(
         _PLAYS, "given", "auto selects the number of operators by held-out loops."

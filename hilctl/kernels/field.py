@@ -5,6 +5,10 @@ Notation: ``v`` is a command, ``w`` the field behind the losses, ``m`` the opera
 are tables over even cells of ``u``, contiguous in memory for speed.
 
 A *play* of threshold r has the output q(F_r[u]); a line of them for each r is Preisach's triangle.
+With thermal activation a play F does not yield at once: while u is d ahead of it, it moves at
+F' = a exp((d - r) / k). So loops widen with the logarithm of the rate, and a held u creeps with the
+logarithm of time. A play of threshold 0 does not creep.
+
 A *drag* of length k relaxes to the position s_u of u in a cell while u moves towards it:
 ds/d|u| = (s_u - s) / k, otherwise ds = 0. Unlike those of plays, its small loops creep. A sample
 moves every cell of a drag but one place in the table of a play, so drags have their own cells,
@@ -39,8 +43,8 @@ from hilctl.kernels.jit import kernel
 
 Bank: TypeAlias = tuple[F64, F64, F64, F64, F64]
 """Thresholds float64[p], lengths float64[d], tables of the plays at the edges of n cells, float64[
-p (n + 1)], weights of the drags in c cells, float64[d c], and the grid, float64[5]: lowest edge,
-width and n for the plays, width and c for the drags."""
+p (n + 1)], weights of the drags in c cells, float64[d c], and the grid, float64[7]: lowest edge,
+width and n for the plays, width and c for the drags; k and a T / k of the creep of the plays."""
 Span: TypeAlias = tuple[float, float, float]
 Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
 """tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, g, e_0, and the part that z
@@ -49,6 +53,7 @@ before a sample has in its mean over the sample; the rest is h's."""
 _BEFORE_POLE = 0.9
 _STEPS = 100
 _NARROWEST = 1e-14
+_STILL, _SURE = -25.0, 300.0  # exponents of the creep without effect, and beyond which it is linear
 _NEAR = 1e-7  # of a change, and of its unit, to which it is worked out
 _OUTPUT, _COMMAND, _FIELD = 0, 1, 2
 _SPAN = "UniTuple(float64, 3)"
@@ -228,22 +233,102 @@ def _move_drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> None:
     memory[sums], memory[sums + 1], memory[sums + 2] = total, up, down
 
 
+@kernel("UniTuple(float64, 4)(float64, float64)", inline=True)
+def _even(change: float, creep: float) -> tuple[float, float, float, float]:
+    """Return what plays that creep have in common while u changes evenly, see :func:`_play`.
+
+    These are the change over k, w; (exp(w) - 1) / w for |w| and for -|w|; and the slope of the
+    logarithm of the first.
+    """
+    if not creep > 0.0:
+        return 0.0, 1.0, 1.0, 0.5
+    way = change / creep
+    size = min(abs(way), _SURE)
+    if size < 1e-4:
+        return way, 1.0 + 0.5 * size, 1.0 - 0.5 * size, 0.5 + size / 12.0
+    grown = math.expm1(size)
+    return way, grown / size, grown / (size * (1.0 + grown)), 1.0 + 1.0 / grown - 1.0 / size
+
+
+@kernel(
+    "UniTuple(float64, 3)(float64, float64, float64, float64, float64, UniTuple(float64, 4))",
+    inline=True,
+)
+def _play(
+    held: float,
+    u: float,
+    threshold: float,
+    creep: float,
+    pace: float,
+    even: tuple[float, float, float, float],
+) -> tuple[float, float, float]:
+    """Return a play after u has changed evenly, its slope by u, and what is left of ``held``.
+
+    ``creep`` is k, ``pace`` is a t / k for the time t of the change. While d changes at a rate R,
+    p = F' / k obeys p' = p (R / k - p).
+    """
+    now = max(min(held, u + threshold), u - threshold)
+    if not creep > 0.0 or threshold == 0.0:
+        moved = 0.0 if now == held else 1.0
+        return now, moved, 1.0 - moved
+    side = 1.0 if u > held else -1.0
+    way = side * even[0]
+    furthest = side * (u - held)
+    ahead = (furthest - threshold) / creep - way
+    most = ahead + max(way, 0.0)
+    if most < _STILL or pace == 0.0:
+        return held, 0.0, 1.0
+    if most > _SURE or way > _SURE:
+        moved = max(most - math.log(max(abs(way), 1.0)) + math.log(pace), 0.0)
+        part = 1.0 if moved > 0.0 else 0.0
+    else:
+        power = pace * math.exp(ahead) * (even[1] if way > 0.0 else even[2])
+        part = power / (1.0 + power)
+        moved = math.log1p(power) if power > 1e-4 else power * (1.0 - power * (0.5 - power / 3.0))
+    if creep * moved > furthest:
+        return u, 1.0, 0.0
+    by_way = even[3] if way > 0.0 else 1.0 - even[3]
+    return held + side * creep * moved, part * by_way, 1.0 - part
+
+
+@kernel(
+    "void(float64[::1], float64[::1], float64, float64, float64, float64[::1], float64[::1])",
+    nogil=True,
+)
+def play_path(
+    u: F64, step_s: F64, threshold: float, creep: float, rate: float, out: F64, by: F64
+) -> None:
+    """Fill in a play from rest along a path, and its slope by the threshold: float64[n] each.
+
+    ``step_s``, float64[n], is the time of each step of ``u``, ``creep`` k and ``rate`` a / k.
+    """
+    held = last = slope = 0.0
+    for k in range(u.size):
+        even = _even(u[k] - last, creep)
+        now, _, kept = _play(held, u[k], threshold, creep, rate * step_s[k], even)
+        slope = kept * slope - (1.0 - kept) * (1.0 if u[k] > held else -1.0)
+        slope = 0.0 if now == u[k] else slope
+        held, last = now, u[k]
+        out[k], by[k] = held, slope
+
+
 @kernel(f"UniTuple(float64, 2)(float64, float64[::1], {_BANK})", inline=True)
 def _peek(u: float, memory: F64, bank: Bank) -> tuple[float, float]:
     """Return the output of the operators at a next u, and its slope, without moving them."""
     thresholds, lengths, values, _, grid = bank
     low, per_cell, cells = grid[0], 1.0 / grid[1], grid[2]
     stride, plays = int(cells) + 1, thresholds.size
+    last = memory[memory.size - 6]
     total = slope = 0.0
+    even = _even(u - last, grid[5])
     for i in range(plays):
-        held = max(min(memory[i], u + thresholds[i]), u - thresholds[i])
+        held, by_u, _ = _play(memory[i], u, thresholds[i], grid[5], grid[6], even)
         place = (held - low) * per_cell
         j = i * stride + _cell(place, cells)
         rise = values[j + 1] - values[j]
         total += values[j] + rise * (place - (j - i * stride))
-        slope += rise if held != memory[i] or i == 0 else 0.0
+        slope += rise * by_u if i else rise
     slope *= per_cell
-    last = memory[memory.size - 6]
     for i in range(lengths.size):
         more, steeper = _drag(u, last, i, memory, bank)
         total += more
@@ -254,11 +339,13 @@ def _peek(u: float, memory: F64, bank: Bank) -> tuple[float, float]:
 @kernel(f"void(float64, float64[::1], {_BANK})", inline=True)
 def _settle(u: float, memory: F64, bank: Bank) -> None:
     """Move all operators to an effective field."""
-    thresholds, lengths = bank[0], bank[1]
+    thresholds, lengths, grid = bank[0], bank[1], bank[4]
+    last = memory[memory.size - 6]
+    even = _even(u - last, grid[5])
     for i in range(thresholds.size):
-        memory[i] = max(min(memory[i], u + thresholds[i]), u - thresholds[i])
+        memory[i] = _play(memory[i], u, thresholds[i], grid[5], grid[6], even)[0]
     for i in range(lengths.size):
-        _move_drag(u, memory[memory.size - 6], i, memory, bank)
+        _move_drag(u, last, i, memory, bank)
     memory[memory.size - 6] = u
 
 
@@ -350,8 +437,8 @@ def _root(
     if what == _COMMAND:
         guess = u + (target - memory[ends + 5]) * memory[ends + 4]
         u = guess if low < guess < high else u
-    if what == _OUTPUT and memory[ends + 4] > 0.0 and low < u < high:
-        # What u gives is known, and the next step goes about as the last one did.
+    if what == _OUTPUT and memory[ends + 4] > 0.0 and low < u < high and not bank[4][5] > 0.0:
+        # What u gives is known unless plays creep, and the next step goes about as the last one.
         short = target - memory[ends + 1]
         if abs(short) <= tolerance:
             return u, memory[ends + 1]

@@ -69,6 +69,18 @@ class FieldLosses(StrictModel):
         )
 
 
+class ThermalActivation(StrictModel):
+    """Creep of plays: behind u by d, a play of threshold r moves at rate exp((d - r) / width).
+
+    Attributes:
+        width: In the input unit; loops are wider by about 2.3 of it per decade of the rate.
+        rate: In input units per s, at which the thresholds hold.
+    """
+
+    width: float = Field(gt=0.0, allow_inf_nan=False)
+    rate: float = Field(gt=0.0, allow_inf_nan=False)
+
+
 class OutputCurve(CheckedModel):
     """A piecewise linear function from the operators' output to displacement, both rising.
 
@@ -108,6 +120,7 @@ class FieldModel(HysteresisModel):
         coupling: Effective field per um of the operators, in input units.
         curve: From the operators' output to displacement.
         losses: Lead of the command.
+        activation: Creep of the plays; None for none.
     """
 
     kind: Literal["field"] = "field"
@@ -119,6 +132,7 @@ class FieldModel(HysteresisModel):
     coupling: float = 0.0
     curve: OutputCurve
     losses: FieldLosses = FieldLosses()
+    activation: ThermalActivation | None = None
 
     def _problems(self) -> Iterator[str]:
         plays, drags = self._lines()
@@ -147,12 +161,16 @@ class FieldModel(HysteresisModel):
         """Return the size of the memory before the previous input."""
         return self.operators + 3 * len(self.lengths) + 5
 
-    def _bank(self) -> Bank:
+    def _bank(self, sample_rate_hz: float) -> Bank:
         slopes, drags = map(np.array, self._lines())
         cells = slopes.shape[1]
         wide = drags.shape[1] if drags.size else cells
         values = play_tables(slopes, self.lowest, self.cell)
-        grid = np.array([self.lowest, self.cell, cells, self.cell * (cells / wide), wide])
+        creep = (0.0, 0.0)
+        if self.activation is not None:
+            width = self.activation.width
+            creep = width, self.activation.rate / (width * sample_rate_hz)
+        grid = np.array([self.lowest, self.cell, cells, self.cell * (cells / wide), wide, *creep])
         lengths = np.array(self.lengths, dtype=np.float64)
         return np.array(self.thresholds), lengths, values.ravel(), drags.ravel(), grid
 
@@ -161,7 +179,7 @@ class FieldModel(HysteresisModel):
         span = self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
         losses = self.losses.sampled(sample_rate_hz, width)
         curve = np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
-        return span, self._bank(), self.coupling, losses, curve
+        return span, self._bank(sample_rate_hz), self.coupling, losses, curve
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""

@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 from hilctl.base.types import F64, I64
 from hilctl.identify.field.design_matrix import needed_points, play_columns, plays_given
 from hilctl.identify.least_squares import RIDGE, SearchPoint, differences
-from hilctl.kernels.field import drag_columns
+from hilctl.kernels.field import drag_columns, play_path
 
 STEEPEST = 6.0  # maximum slope of the curve, of its mean
 SMOOTH = 0.01  # weight of a difference of neighbours, relative to the longest column
@@ -46,6 +46,15 @@ class Grid:
     def piece(self) -> float:
         """Width of a piece of the splines."""
         return self.width * self.cells / (self.cells - 2)
+
+
+@dataclass(frozen=True, slots=True)
+class Creep:
+    """Thermal activation of the plays, see :class:`~hilctl.models.effective_field.FieldModel`."""
+
+    width: float
+    rate: float
+    steps_s: Sequence[F64]  # time of each step of each path
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,14 +89,15 @@ class Weights:
         return np.asarray(given - curve.operators_of(y))
 
 
-def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid) -> F64:
+def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, creep: Creep | None = None) -> F64:
     """Return each operator's output per cell at the kept samples: float64[N, lines cells]."""
     plays, cells = grid.thresholds.size, grid.cells
     parts: list[F64] = []
-    for path, samples in zip(paths, kept, strict=True):
+    for k, (path, samples) in enumerate(zip(paths, kept, strict=True)):
         u, rows = _needed(path, samples)
         out = np.empty((rows.size, grid.lines * cells))
-        play_columns(u, rows, grid.thresholds, grid.lowest, grid.piece, cells, out)
+        held, _ = _plays(k, (path, samples), (u, rows), grid, creep)
+        play_columns(held, grid.lowest, grid.piece, cells, out)
         for i, length in enumerate(grid.lengths):
             first = (plays + i) * cells
             drag_columns(u, rows, length, grid.lowest, grid.width, cells, first, out)
@@ -101,17 +111,40 @@ def _needed(path: F64, samples: I64) -> tuple[F64, I64]:
     return path[points[: needed_points(path, samples, points, rows)]], rows
 
 
-def outputs(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, slopes: F64) -> tuple[F64, F64]:
+def _plays(
+    k: int, whole: tuple[F64, I64], needed: tuple[F64, I64], grid: Grid, creep: Creep | None
+) -> tuple[F64, F64]:
+    """Return the positions of plays at the kept samples, and their slopes by the thresholds."""
+    # Plays that creep depend on the time of each point.
+    u, rows = needed if creep is None else whole
+    steps_s = np.zeros(u.size) if creep is None else creep.steps_s[k]
+    width, rate = (0.0, 0.0) if creep is None else (creep.width, creep.rate / creep.width)
+    both = np.empty((2, grid.thresholds.size, rows.size))
+    at, by = np.empty(u.size), np.empty(u.size)
+    for i, threshold in enumerate(grid.thresholds):
+        play_path(u, steps_s, threshold, width, rate, at, by)
+        both[:, i] = at[rows], by[rows]
+    return both[0], both[1]
+
+
+def outputs(
+    paths: Sequence[F64],
+    kept: Sequence[I64],
+    grid: Grid,
+    slopes: F64,
+    creep: Creep | None = None,
+) -> tuple[F64, F64]:
     """Return the output of weighted operators and its slopes by thresholds: float64[N, p - 1]."""
     plays = grid.thresholds.size
     drags = replace(grid, thresholds=np.empty(0))
     given: list[F64] = []
     changes: list[F64] = []
-    for path, samples in zip(paths, kept, strict=True):
+    for k, (path, samples) in enumerate(zip(paths, kept, strict=True)):
         u, rows = _needed(path, samples)
         total, by = np.empty(rows.size), np.empty((rows.size, plays))
         weights = np.ascontiguousarray(slopes[:plays])
-        plays_given(u, rows, grid.thresholds, grid.lowest, grid.piece, weights, total, by)
+        held, change = _plays(k, (path, samples), (u, rows), grid, creep)
+        plays_given(held, change, grid.lowest, grid.piece, weights, total, by)
         if grid.lengths.size:
             total += table([u], [rows], drags) @ slopes[plays:].ravel()
         given.append(total)

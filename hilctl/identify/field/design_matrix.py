@@ -143,72 +143,49 @@ def _risen(u: float, lowest: float, width: float, s: F64, edges: F64) -> tuple[f
     return edges[j] + width * (value + 0.5 * s[j + 2] * third + slope * beyond), slope
 
 
-@kernel(
-    "void(float64[::1], int64[::1], float64[::1], float64, float64, int64, float64[:, ::1])",
-    nogil=True,
-)
-def play_columns(
-    u: F64, rows: I64, thresholds: F64, lowest: float, width: float, splines: int, out: F64
-) -> None:
-    """Fill in the output of each play from rest, with a quadratic B-spline as its slope.
+@kernel("void(float64[:, ::1], float64, float64, int64, float64[:, ::1])", nogil=True)
+def play_columns(held: F64, lowest: float, width: float, splines: int, out: F64) -> None:
+    """Fill in the output of plays with a quadratic B-spline as slope, for their positions.
 
-    The path ``u``, float64[n], needs at least its turning points. The c >= 3 splines have c - 2
-    pieces of equal width from ``lowest`` on; slopes are constant beyond. ``out``, float64[N, m], is
-    filled at ``rows`` in the first p c columns.
+    Positions are float64[p, N]. The c >= 3 splines have c - 2 pieces of equal width from ``lowest``
+    on; slopes are constant beyond. ``out``, float64[N, m], is filled in the first p c columns.
     """
     rest = np.zeros(splines)
     _add_splines(0.0, lowest, width, -1.0, rest)
-    for i in range(thresholds.size):
-        held = 0.0
-        first, k = i * splines, 0
-        for row in range(rows.size):
-            while k <= rows[row]:
-                held = max(min(held, u[k] + thresholds[i]), u[k] - thresholds[i])
-                k += 1
+    for i in range(held.shape[0]):
+        first = i * splines
+        for row in range(held.shape[1]):
             columns = out[row, first : first + splines]
             columns[:] = rest
-            _add_splines(held, lowest, width, 1.0, columns)
+            _add_splines(held[i, row], lowest, width, 1.0, columns)
 
 
 @kernel(
-    "void(float64[::1], int64[::1], float64[::1], float64, float64, float64[:, ::1],"
-    " float64[::1], float64[:, ::1])",
+    "void(float64[:, ::1], float64[:, ::1], float64, float64, float64[:, ::1], float64[::1],"
+    " float64[:, ::1])",
     nogil=True,
 )
 def plays_given(
-    u: F64,
-    rows: I64,
-    thresholds: F64,
-    lowest: float,
-    width: float,
-    weights: F64,
-    total: F64,
-    by: F64,
+    held: F64, change: F64, lowest: float, width: float, weights: F64, total: F64, by: F64
 ) -> None:
     """Compute the total output of plays with known weights, float64[p, c], and its derivatives.
 
-    Fill in ``total``, float64[N], and its derivatives by each threshold, float64[N, p]; see
-    :func:`play_columns` for the others.
+    ``change``, float64[p, N], is that of each position by the threshold. Fill in ``total``,
+    float64[N], and its derivatives by each threshold, float64[N, p]; see :func:`play_columns`.
     """
     pieces = weights.shape[1] - 2
     edges = np.empty(pieces + 1)
     total[:] = 0.0
-    for i in range(thresholds.size):
+    for i in range(held.shape[0]):
         s = weights[i]
         edges[0] = 0.0
         for j in range(pieces):
             edges[j + 1] = edges[j] + width / 6.0 * (s[j] + 4.0 * s[j + 1] + s[j + 2])
-        held, side, k = 0.0, 0.0, 0
         rest = _risen(0.0, lowest, width, s, edges)[0]
-        for row in range(rows.size):
-            while k <= rows[row]:
-                low, high = u[k] - thresholds[i], u[k] + thresholds[i]
-                side = -1.0 if held < low else (1.0 if held > high else side)
-                held = max(min(held, high), low)
-                k += 1
-            value, slope = _risen(held, lowest, width, s, edges)
+        for row in range(held.shape[1]):
+            value, slope = _risen(held[i, row], lowest, width, s, edges)
             total[row] += value - rest
-            by[row, i] = slope * side
+            by[row, i] = slope * change[i, row]
 
 
 LEAST_SWING = 0.1  # of the stroke: smaller swings count as this one

@@ -279,6 +279,11 @@ class DuhemSearch:
         mean = np.log(data.stroke_um / (2.0 * data.reach))
         self._log_range = float(np.log(least)), float(mean + STEEPEST)
 
+    @property
+    def free(self) -> int:
+        """Number of search variables that are not fixed."""
+        return int(np.count_nonzero(self._low < self._high))
+
     def find(self, progress: OnProgress) -> DuhemEnd:
         """Search with a coarse table, then with the requested size."""
         x = self._first.copy()
@@ -380,6 +385,9 @@ class DuhemSearch:
         self._errors(x, logs, slopes[:, :size])
         for k in reversed(range(size, slopes.shape[1])):  # the offset first: paths are still cached
             there, stage = x.copy(), k - size
+            if self._low[stage] == self._high[stage]:
+                slopes[:, k] = 0.0
+                continue
             step = DIFFERENCE * STEPS[stage]
             there[stage] += step if x[stage] + step <= self._high[stage] else -step
             change = self._errors(there, logs) - errors
@@ -460,7 +468,7 @@ def fit_generalised_duhem(job: FitJob) -> FoundModel:
     else:
         found = search.find(job.progress)
     parameters = found.known.parameters(found.offset_um)
-    numbers = found.logs.size + len(NAMES)
+    numbers = found.logs.size + search.free
     return FoundModel(_model(job, found), numbers, parameters, at_bound=found.at_bound, end=found)
 
 

@@ -6,7 +6,15 @@ from dataclasses import dataclass, replace
 import numpy as np
 
 from hilctl.base.types import F64, I64
-from hilctl.identify.field.densities import Curve, Equations, Grid, Weights, outputs, table
+from hilctl.identify.field.densities import (
+    Creep,
+    Curve,
+    Equations,
+    Grid,
+    Weights,
+    outputs,
+    table,
+)
 from hilctl.identify.field.design_matrix import chosen
 from hilctl.identify.field.preprocess import Prepared, histories_of
 from hilctl.identify.field.stages import (
@@ -41,6 +49,7 @@ class BareSignal:
     fields: Sequence[F64]
     y: F64
     scale: F64
+    creep: Creep | None = None
 
 
 class JointRefinement:
@@ -83,7 +92,7 @@ class JointRefinement:
         """Return the equations of a point; those of the last point are cached."""
         if self._tried is None or not np.array_equal(self._tried[0], x):
             rows, grid = self._rows_of(x[:STAGES]), self._laid(x)
-            columns = table(rows.fields, self._paths, grid)
+            columns = table(rows.fields, self._paths, grid, rows.creep)
             equations = Equations(columns, rows.y, grid, self._least, rows.scale)
             self._tried = x.copy(), equations, rows
         return self._tried[1:]
@@ -92,7 +101,9 @@ class JointRefinement:
         equations, rows = self._equations(x)
         grid, found = self._laid(x), equations.solve()
         changes = np.empty((rows.y.size, x.size))
-        given, changes[:, STAGES:] = outputs(rows.fields, self._paths, grid, found.slopes)
+        given, changes[:, STAGES:] = outputs(
+            rows.fields, self._paths, grid, found.slopes, rows.creep
+        )
         here = found.errors_of(given, rows.y)
         for i in range(STAGES):
             if self._space.low[i] == self._space.high[i]:
@@ -101,7 +112,7 @@ class JointRefinement:
             there = x.copy()
             there[i] += TRIED * unit[i] if x[i] + TRIED * unit[i] <= high[i] else -TRIED * unit[i]
             moved = self._rows_of(there[:STAGES])
-            given, _ = outputs(moved.fields, self._paths, grid, found.slopes)
+            given, _ = outputs(moved.fields, self._paths, grid, found.slopes, moved.creep)
             errors = found.errors_of(given, moved.y)
             changes[:, i] = (errors * moved.scale / rows.scale - here) / (there[i] - x[i])
         return equations.place(here, changes)
@@ -160,10 +171,17 @@ class FieldSearch:
     """Search of weights and stages of one size of model; ``least`` is in um per command unit."""
 
     def __init__(
-        self, data: Prepared, size: Size, least: float, structure: Structure = True
+        self,
+        data: Prepared,
+        size: Size,
+        least: float,
+        structure: Structure = True,
+        *,
+        activation: bool = False,
     ) -> None:
         self._data, self._size, self._least = data, size, least
-        self._space, self._measured = StageSpace.of(data, structure), structure is not True
+        self._space = StageSpace.of(data, structure, activation=activation)
+        self._measured = structure is not True
         self._choose(SEARCH_ROWS)
         self._curve: Curve | None = None
         self._grid: Grid | None = None
@@ -227,13 +245,16 @@ class FieldSearch:
 
     def _solved(self, x: F64) -> Weights:
         bare, grid = self._bare(x), self._laid()
-        columns = table(bare.fields, self._rows.samples, grid)
+        columns = table(bare.fields, self._rows.samples, grid, bare.creep)
         return Equations(columns, bare.y, grid, self._least, bare.scale).solve()
 
     def _bare(self, x: F64) -> BareSignal:
         fields, bare = self._signals(x)
         y = np.concatenate([b[at] for b, at in zip(bare, self._rows.samples, strict=True)])
-        return BareSignal(fields, y, self._scale(y))
+        known = physical(stages_in(x), self._data).activation
+        steps_s = [run.step_s for run in self._data.runs]
+        creep = None if known is None else Creep(known.width, known.rate, steps_s)
+        return BareSignal(fields, y, self._scale(y), creep)
 
     def _signals(self, x: F64) -> tuple[list[F64], list[F64]]:
         known = physical(stages_in(x), self._data)
@@ -321,7 +342,7 @@ def fit_field(job: FitJob) -> FoundModel:
     settings = job.settings
     data = Prepared(histories_of(job.data.records, "an effective field"))
     size = Size(settings.plays, settings.drags, settings.cells, settings.knots)
-    search = FieldSearch(data, size, job.least, job.structure)
+    search = FieldSearch(data, size, job.least, job.structure, activation=settings.activation)
     if isinstance(job.start, FieldEnd):
         found = search.go_on(job.start)
     else:
@@ -346,6 +367,7 @@ def _model(job: FitJob, found: FieldEnd) -> StagedModel:
             displacement_um=tuple(weights.curve.displacement_um.tolist()),
         ),
         losses=known.losses,
+        activation=known.activation,
         **job.data.common(weights.offset_um),
     )
     return StagedModel.around(hysteresis, structure=known.structure, delay_s=known.delay_s)

@@ -11,7 +11,7 @@ from hilctl.identify.field.densities import Curve
 from hilctl.identify.field.preprocess import Prepared, Run
 from hilctl.identify.fit_api import Structure
 from hilctl.kernels.field import field_left
-from hilctl.models.effective_field import FieldLosses, even_excess
+from hilctl.models.effective_field import FieldLosses, ThermalActivation, even_excess
 from hilctl.models.linear_stages import FirstMode
 
 
@@ -28,6 +28,7 @@ class Stages:
     radian: float = 0.1  # 1 / w of the structure
     damping: float = 0.2  # its damping ratio
     delay: float = 0.03  # transport delay
+    activation: float = 0.0  # width of the thermal activation of plays
 
 
 SHORTEST_S = 1e-9  # of lags
@@ -35,12 +36,13 @@ SHORTEST_S = 1e-9  # of lags
 NAMES = tuple(field.name for field in fields(Stages))
 PARAMETERS = (
     "field_s", "output_s", "decay_s", "growth", "excess", "self_growth",
-    "natural_hz", "damping_ratio", "delay_s",
+    "natural_hz", "damping_ratio", "delay_s", "activation_width",
 )  # fmt: skip
 """Published names, in the same order."""
-LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0)
-HIGH = Stages(2.0, 2.0, 0.3, 10.0, 0.5, 10.0, 0.3, 2.0, 0.3)
-STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.01, 0.05, 0.02, 0.05, 0.01)
+LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0, 0.0)
+HIGH = Stages(2.0, 2.0, 0.3, 10.0, 0.5, 10.0, 0.3, 2.0, 0.3, 0.0)
+STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.01, 0.05, 0.02, 0.05, 0.01, 0.002)
+ACTIVATION = (0.002, 0.05)  # bounds of the width if plays creep
 """Bounds, and changes that have about the same effect."""
 
 
@@ -63,6 +65,7 @@ class Physical:
     damping_ratio: float
     delay_s: float
     lag_s: float
+    activation: ThermalActivation | None = None
 
     @property
     def structure(self) -> FirstMode | None:
@@ -77,6 +80,7 @@ class Physical:
         named = self.losses.model_dump()
         named |= self.structure.model_dump() if self.structure else {}
         named |= {"delay_s": self.delay_s}
+        named |= {"activation_width": self.activation.width} if self.activation else {}
         known = {name: named[name] for name in PARAMETERS if name in named}
         return {**known, "output_offset_um": offset_um}
 
@@ -93,12 +97,14 @@ def physical(stages: Stages, data: Prepared) -> Physical:
         excess=stages.excess * math.sqrt(data.reach),
         self_growth=stages.self_growth / data.reach,
     )
+    width, fastest = stages.activation * data.reach, data.reach / unit_s
     return Physical(
         losses,
         stages.radian * unit_s,
         stages.damping,
         stages.delay * unit_s,
         (stages.field + stages.output) * unit_s,
+        ThermalActivation(width=width, rate=fastest) if width > 0.0 else None,
     )
 
 
@@ -117,6 +123,7 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
         radian=known.radian_s / unit_s,
         damping=known.damping_ratio,
         delay=known.delay_s / unit_s,
+        activation=known.activation.width / data.reach if known.activation else 0.0,
     )
 
 
@@ -133,9 +140,14 @@ class StageSpace:
     high: F64
 
     @classmethod
-    def of(cls, data: Prepared, structure: Structure) -> Self:
+    def of(cls, data: Prepared, structure: Structure, *, activation: bool = False) -> Self:
         """Return the space for a measured structure, an unknown one (True), or none (False)."""
         low, high = LOW, HIGH
+        if activation:
+            low, high = (
+                replace(each, activation=width)
+                for each, width in zip((low, high), ACTIVATION, strict=True)
+            )
         if structure is False:
             low, high = (replace(each, radian=0.0, damping=0.0) for each in (low, high))
         elif structure is not True:

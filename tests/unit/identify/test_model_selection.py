@@ -113,6 +113,7 @@ def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> li
             "field": f"field {settings.drags} {settings.plays}",
             "generalised_duhem": f"generalised_duhem {settings.cells}",
         }.get(settings.kind, settings.kind)
+        name += " creeping" * settings.looks_for("activation")
         seen.append((name, request.start))
         rms = errors[name]
         if rms is None:
@@ -149,6 +150,19 @@ def test_the_kind_whose_small_model_does_well_is_tried_in_full(monkeypatch):
     starts = [start for _, start in seen]
     assert starts == [None, None, "end of field 0 8", "end of field 0 32"]
     assert held_out.end == "end of field 3 32"
+
+
+def test_plays_that_creep_are_tried_in_full_if_rests_creep(monkeypatch):
+    monkeypatch.setattr(model_selection, "creep_of", lambda records: object())
+    creeping = {
+        "field 0 8 creeping": 0.3,
+        "field 0 16 creeping": 0.15,
+        "field 3 16 creeping": 0.1,
+    }
+    seen = fake(monkeypatch, {**SMALL, "generalised_duhem 12": 9.0, **creeping})
+    settings, _ = chosen([HISTORY])
+    assert settings.activation
+    assert [name for name, _ in seen][-1] == "field 3 16 creeping"
 
 
 def test_full_models_with_a_large_error_are_tried_from_the_data_too(monkeypatch):

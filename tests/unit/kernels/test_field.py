@@ -13,6 +13,7 @@ from hilctl.kernels.field import (
     field_left,
     lost_field,
     mapped,
+    play_path,
 )
 from hilctl.kernels.hysteresis import rest_memory
 
@@ -27,8 +28,10 @@ BANK = (
     LENGTHS,
     (VALUES - VALUES[:, [2]]).ravel(),  # the third edge is at 0
     DRAGS.ravel(),
-    np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS]),
+    np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS, 0.0, 0.0]),
 )
+CREEP, PACE = 0.3, 0.5
+CREEPING = (*BANK[:-1], np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS, CREEP, PACE]))
 SPAN = (-12.0, 12.0, 1e-10)
 LOSSES = (3.0, 0.4, 0.6, 0.1, 0.02, 0.05, 0.2, 0.01, -0.4 / math.log(0.6))
 NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
@@ -39,7 +42,7 @@ LINE = (  # one play without a threshold, of slope 2
     np.zeros(0),
     np.array([-8.0, 8.0]),
     np.zeros(0),
-    np.array([-4.0, 8.0, 1.0, 8.0, 1.0]),
+    np.array([-4.0, 8.0, 1.0, 8.0, 1.0, 0.0, 0.0]),
 )
 
 
@@ -114,6 +117,47 @@ def test_model_and_inverse_are_the_equations(coupling, losses):
     np.testing.assert_allclose(run(field_inverse, y, **given), command, atol=1e-7)
 
 
+def play_along(u, threshold=0.8, creep=CREEP, pace=PACE):
+    out, by = np.empty_like(u), np.empty_like(u)
+    play_path(u, np.ones(u.size), threshold, creep, pace, out, by)
+    return out, by
+
+
+def test_a_play_that_creeps_follows_its_equation():
+    u = 2.5 * np.sin(np.arange(200) / 20.0)
+    held, last, expected = 0.0, 0.0, []
+    for now in u:
+        for part in np.linspace(last, now, 101)[1:]:
+            ahead = part - held
+            rate = CREEP * PACE * math.exp((abs(ahead) - 0.8) / CREEP) / 100
+            held += math.copysign(min(rate, abs(ahead)), ahead)
+        last = now
+        expected.append(held)
+    assert play_along(u)[0] == pytest.approx(np.array(expected), abs=1e-2)
+
+
+def test_a_play_creeps_with_the_logarithm_of_time_towards_the_static_one():
+    held = play_along(np.full(10_000, 6.0), 4.0)[0]
+    decades = np.diff(held[[9, 99, 999, 9999]])
+    assert decades == pytest.approx(CREEP * math.log(10.0), rel=0.1)
+    static = play_along(path(), creep=0.0)[0]
+    assert play_along(path(), creep=1e-3, pace=1.0)[0] == pytest.approx(static, abs=0.02)
+
+
+@pytest.mark.parametrize("creep", [0.0, CREEP])
+def test_the_slope_of_a_play_by_its_threshold(creep):
+    u = np.ascontiguousarray(path()[::7])
+    change = (play_along(u, 0.8 + 1e-6, creep)[0] - play_along(u, 0.8 - 1e-6, creep)[0]) / 2e-6
+    assert play_along(u, creep=creep)[1] == pytest.approx(change, abs=1e-4)
+
+
+def test_the_inverse_undoes_plays_that_creep():
+    y = np.interp(operators(path()), *CURVE)
+    command = run(field_inverse, y, CREEPING)
+    assert run(field_forward, command, CREEPING) == pytest.approx(y, abs=1e-6)
+    assert np.ptp(command - run(field_inverse, y)) > 0.1
+
+
 def test_the_first_command_counts_as_having_stood_for_ever():
     """m = s u and u = w + coupling m give m = s w / (1 - coupling s), and nothing more comes."""
     held = np.full(4, 1.5)
@@ -126,7 +170,7 @@ def test_drags_have_cells_of_their_own():
     plays = np.array([-8.0, -4.0, 0.0, 4.0, 8.0])
     bank = (
         np.zeros(1), np.array([length]), 2.0 * plays, np.array([3.0]),
-        np.array([-8.0, 4.0, 4.0, -4.0 + 20.0, 1.0]),
+        np.array([-8.0, 4.0, 4.0, -4.0 + 20.0, 1.0, 0.0, 0.0]),
     )  # fmt: skip
     held, m, last = 8.0, [], 0.0
     for now in u:

@@ -6,7 +6,12 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
+from hilctl.models.effective_field import (
+    FieldLosses,
+    FieldModel,
+    OutputCurve,
+    ThermalActivation,
+)
 
 RATE_HZ = 50_000.0
 CURVE = OutputCurve(operators_um=(-60.0, 0.0, 60.0), displacement_um=(-50.0, 0.0, 45.0))
@@ -19,6 +24,8 @@ LOSSES = FieldLosses(
     excess=0.05,
     self_growth=0.2,
 )
+
+ACTIVATION = ThermalActivation(width=0.2, rate=1000.0)
 
 
 def field_model(**changes):
@@ -45,9 +52,10 @@ def reference_um(seed):
     return np.ascontiguousarray(9.0 * np.minimum(t / 0.02, 1.0) * sines)
 
 
+@pytest.mark.parametrize("activation", [None, ACTIVATION])
 @pytest.mark.parametrize("coupling", [-0.03, 0.0, 0.03])
-def test_inverse_undoes_the_model(coupling):
-    model = field_model(coupling=coupling)
+def test_inverse_undoes_the_model(coupling, activation):
+    model = field_model(coupling=coupling, activation=activation)
     wanted_um = reference_um(1)
     command = model.inverse(RATE_HZ).process(wanted_um)
     assert model.forward(RATE_HZ).process(command) == pytest.approx(wanted_um, abs=1e-4)

@@ -16,7 +16,7 @@ from hilctl.models.plays import SpiModel
 from hilctl.models.refined import RefinedModel
 from hilctl.models.staged import AnyHysteresis, StagedModel
 from tests.published import piezo_ppi, terfenol_rdpi
-from tests.unit.models.test_effective_field import field_model
+from tests.unit.models.test_effective_field import ACTIVATION, field_model
 from tests.unit.models.test_generalised_duhem import duhem_model
 from tests.unit.models.test_implicit_models import BOUC_WEN, DUHEM, KP, PLAIN, PREISACH
 from tests.unit.models.test_integrated import butterfly
@@ -44,6 +44,7 @@ FORMS = {
     "generalised_duhem": StagedModel.around(duhem_model()),
     "refined": RefinedModel.of(terfenol_rdpi(), residual(), 0.4),
 }  # fmt: skip
+FORMS["plays that creep"] = field_model(activation=ACTIVATION)
 FORMS["linear lag"] = StagedModel.around(OMEGA, **STAGES["linear lag"])
 FORMS["exponent 2"] = BOUC_WEN.model_copy(update={"exponent": 2})
 

@@ -174,7 +174,7 @@ def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for():
     assert coarse.field.min() == path.field.min()
 
 
-@pytest.mark.parametrize("stage", range(len(NAMES)))
+@pytest.mark.parametrize("stage", [k for k, name in enumerate(NAMES) if name != "activation"])
 def test_paths_follow_every_stage_but_the_offset(stage):
     kept, fresh = Signals(data()), Signals(data())
     for signals in (kept, fresh):
