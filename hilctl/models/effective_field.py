@@ -1,7 +1,7 @@
 """The effective-field model: plays and drags of a field, a curve, eddy-current losses."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Callable, Iterator
 from typing import Annotated, Any, Literal
 
 import numpy as np
@@ -183,10 +183,43 @@ class FieldModel(HysteresisModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        parameters, size = self._parameters(sample_rate_hz), self._numbers()
-        return Operator(field_forward, parameters, size, output_offset=self.output_offset_um)
+        offset_um = self.output_offset_um
+        return self._operator(field_forward, sample_rate_hz, output_offset=offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
+        offset_um = self.output_offset_um
+        return self._operator(field_inverse, sample_rate_hz, input_offset=-offset_um)
+
+    def _operator(
+        self, kernel: Callable[..., None], sample_rate_hz: float, **offset: float
+    ) -> Operator:
         parameters, size = self._parameters(sample_rate_hz), self._numbers()
-        return Operator(field_inverse, parameters, size, input_offset=-self.output_offset_um)
+        if self.activation is None:
+            return Operator(kernel, parameters, size, **offset)
+        return _CreepingOperator(self._parameters, kernel, parameters, size, **offset)
+
+
+class _CreepingOperator(Operator):
+    """The model or its inverse with plays that continue to creep at constant command."""
+
+    def __init__(
+        self,
+        at_rate: Callable[[float], tuple[Any, ...]],  # returns the parameters at a sample rate
+        kernel: Callable[..., None],
+        parameters: tuple[Any, ...],
+        operators: int,
+        **offset: float,
+    ) -> None:
+        super().__init__(kernel, parameters, operators, **offset)
+        self._at_rate = at_rate
+
+    def stand(self, seconds: float) -> None:
+        """Let time pass at constant command: one long sample of the model, for both directions."""
+        if seconds > 0.0 and math.isfinite(self._memory[-1]):
+            move: Callable[..., None] = field_forward
+            moved_um = np.empty(1)
+            move(self._memory[[-3]], *self._at_rate(1.0 / seconds), self._memory, moved_um)
+            self._memory[-2] = 0.0
+            if self.kernel is field_inverse:
+                self._memory[-1] = moved_um[0]

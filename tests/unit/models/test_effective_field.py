@@ -62,6 +62,22 @@ def test_inverse_undoes_the_model(coupling, activation):
     assert np.ptp(command) > 5.0
 
 
+def test_plays_that_creep_do_so_between_runs():
+    slow = ThermalActivation(width=0.1, rate=10.0)
+    model, rate_hz = field_model(activation=slow, coupling=0.0), 1000.0
+    rise = np.concatenate((np.linspace(0.0, 2.0, 50), np.full(50, 2.0)))
+    held, stood = model.forward(rate_hz), model.forward(rate_hz)
+    before, *_, after = held.process(np.concatenate((rise, np.full(5000, 2.0))))[rise.size - 1 :]
+    stood.process(rise)
+    stood.stand(5.0)
+    assert after > before + 0.2
+    assert stood.process(np.full(1, 2.0)) == pytest.approx(after, abs=1e-3)
+    inverse = model.inverse(rate_hz)
+    inverse.process(model.forward(rate_hz).process(rise))
+    inverse.stand(5.0)
+    assert inverse.process(np.full(1, after)) == pytest.approx(2.0, abs=1e-3)
+
+
 def test_small_biased_loops_creep_by_drags_and_close_by_plays():
     loop = [*np.linspace(5.0, 4.0), *np.linspace(4.0, 5.0)]
     turns = np.concatenate([np.linspace(0.0, 5.0), np.tile(loop, 8)])
