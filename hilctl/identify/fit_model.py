@@ -66,8 +66,7 @@ class _Rest:
 
 def creep_of(records: Sequence[Record]) -> CreepModel | None:
     """Return the creep during rests; None if there is none, or fewer than two rests of 0.5 s."""
-    histories = [_coarse(record) for record in records if isinstance(record, History)]
-    rests = [rest for i, history in enumerate(histories) for rest in _rests(i, history)]
+    histories, rests = _resting(records)
     if len(rests) < 2:
         return None
     least_squares = _LeastSquares(histories, rests)
@@ -77,6 +76,18 @@ def creep_of(records: Sequence[Record]) -> CreepModel | None:
         if creep is None:
             return None
     return creep
+
+
+def creeps(records: Sequence[Record]) -> bool:
+    """Return whether displacements move during rests, other than by heat and drift."""
+    histories, rests = _resting(records)
+    return len(rests) > 1 and _LeastSquares(histories, rests).moves
+
+
+def _resting(records: Sequence[Record]) -> tuple[list[History], list[_Rest]]:
+    """Return coarse histories, and their rests."""
+    histories = [_coarse(record) for record in records if isinstance(record, History)]
+    return histories, [rest for i, each in enumerate(histories) for rest in _rests(i, each)]
 
 
 def without_creep(records: Sequence[Record], creep: CreepModel) -> tuple[Record, ...]:
@@ -140,6 +151,11 @@ class _LeastSquares:
         measured = self._means([history.displacement_um for history in histories])
         self._measured_um = self._rest_of(measured)
         self._least_um = LEAST_MOVE * max(float(np.ptp(each.displacement_um)) for each in histories)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the motion during rests is clear."""
+        return bool(np.abs(self._measured_um).max() > self._least_um)
 
     def solve(self, bare_um: Sequence[F64]) -> CreepModel | None:
         """Return the creep of displacements, float64[n] each; None if there is none."""

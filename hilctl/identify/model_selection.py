@@ -16,7 +16,7 @@ from hilctl.base.types import F64
 from hilctl.identify.data.records import History, Record, Records, SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge, judgement_of
 from hilctl.identify.fit_api import FitData, FitRequest, OnProgress, ignore_progress
-from hilctl.identify.fit_model import creep_of, fit_kind, fit_model
+from hilctl.identify.fit_model import creeps, fit_kind, fit_model
 from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import FitSettings, IdentifySettings
 
@@ -238,8 +238,8 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
     """Return the kind with the least error."""
     # Small models select the kinds to try at full size: a wrong kind is far off at any size.
     whole = any(isinstance(record, History) for record in request.records)
-    creeps = given.creep_stage and creep_of(request.records) is not None
-    histories = (*WHOLE, CREEPING) if creeps else WHOLE
+    creeping = given.creep_stage and creeps(request.records)
+    histories = (*WHOLE, CREEPING) if creeping else WHOLE
     errors = _candidates(request, given, histories if whole else LOOPS)
     if whole and not any(each.stroke_percent < WELL_PERCENT for each in errors):
         errors += _candidates(request, given, (PLAIN,))

@@ -16,6 +16,7 @@ from hilctl.identify.fit_api import LEAST_SLOPE, FitData, FitRequest
 from hilctl.identify.fit_model import (
     FittedModel,
     creep_of,
+    creeps,
     fit_kind,
     fit_model,
     identified_range,
@@ -373,7 +374,9 @@ def crept(creep, time_s):
 
 @pytest.mark.parametrize(("heat", "drift"), [(0.0, 0.0), (0.06, 0.0), (0.0, 0.5)])
 def test_what_a_step_creeps_by_is_found_whatever_the_time_constants(heat, drift):
-    found = creep_of([history(heat=heat, drift=drift)[0]])
+    records = [history(heat=heat, drift=drift)[0]]
+    assert creeps(records)
+    found = creep_of(records)
     time_s = np.array([0.1, 0.3, 1.0, 3.0])
     np.testing.assert_allclose(crept(found, time_s), crept(CREEP, time_s), rtol=0.1)
     assert not set(found.time_constants_s) & set(CREEP.time_constants_s)
@@ -390,7 +393,9 @@ def test_what_is_left_is_the_displacement_without_creep():
 
 @pytest.mark.parametrize(("heat", "drift"), [(0.0, 0.0), (0.02, 0.0), (0.0, 0.05)])
 def test_nothing_creeps_where_nothing_does(heat, drift):
-    assert creep_of([history(None, heat=heat, drift=drift)[0]]) is None
+    records = [history(None, heat=heat, drift=drift)[0]]
+    assert not creeps(records)
+    assert creep_of(records) is None
 
 
 @pytest.mark.parametrize("seed", range(8))

@@ -153,7 +153,7 @@ def test_the_kind_whose_small_model_does_well_is_tried_in_full(monkeypatch):
 
 
 def test_plays_that_creep_are_tried_in_full_if_rests_creep(monkeypatch):
-    monkeypatch.setattr(model_selection, "creep_of", lambda records: object())
+    monkeypatch.setattr(model_selection, "creeps", lambda records: True)
     creeping = {
         "field 0 8 creeping": 0.3,
         "field 0 16 creeping": 0.15,
