@@ -155,9 +155,9 @@ def test_the_kind_whose_small_model_does_well_is_tried_in_full(monkeypatch):
 def test_plays_that_creep_are_tried_in_full_if_rests_creep(monkeypatch):
     monkeypatch.setattr(model_selection, "creeps", lambda records: True)
     creeping = {
-        "field 0 8 creeping": 0.3,
-        "field 0 16 creeping": 0.15,
-        "field 3 16 creeping": 0.1,
+        "field 0 8 creeping": 0.2,
+        "field 0 16 creeping": 0.08,
+        "field 3 16 creeping": 0.05,
     }
     seen = fake(monkeypatch, {**SMALL, "generalised_duhem 12": 9.0, **creeping})
     settings, _ = chosen([HISTORY])
