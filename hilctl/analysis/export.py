@@ -6,7 +6,7 @@ Numbers are kept bit for bit. CSV files have no place for the facts of the run.
 import json
 import re
 from collections import deque
-from collections.abc import Callable, Iterable
+from collections.abc import Callable, Iterable, Iterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
@@ -21,7 +21,8 @@ from hilctl.analysis.catalogue import Entry, read_catalogue
 from hilctl.analysis.export_files import FORMATS, ColumnFile, Columns, Facts, ParquetFile, arrow
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, make_folder, write_file
-from hilctl.base.samples import COLUMNS, RECORDED_FIELDS
+from hilctl.base.samples import COLUMNS, RECORDED_FIELDS, RecordedField
+from hilctl.base.types import F64
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.recording import Recording
 
@@ -111,19 +112,21 @@ def write_pieces(
 def columns(recording: Recording) -> Columns:
     """Return the columns of an export by name."""
     samples = recording.samples
-    named = {
-        COLUMNS[name].field(recording.command_unit).name: values
-        for name, values in samples.columns().items()
-        if values.size
-    }
+    named = {each.name: values for each, values in _recorded(recording)}
     times_s = samples.index / recording.sample_rate_hz
     return {"sample": samples.index, "t_s": times_s, **named, "flags": samples.flags}
 
 
 def units(recording: Recording) -> dict[str, str]:
     """Return the unit of each column of :func:`columns` that has one."""
-    fields = [COLUMNS[name].field(recording.command_unit) for name in recording.samples.columns()]
-    return {"t_s": "s", **{each.name: each.unit for each in fields}}
+    return {"t_s": "s", **{each.name: each.unit for each, _ in _recorded(recording)}}
+
+
+def _recorded(recording: Recording) -> Iterator[tuple[RecordedField, F64]]:
+    """Yield the columns that the recording has, with their values."""
+    for name, values in recording.samples.columns().items():
+        if values.size:
+            yield COLUMNS[name].field(recording.command_unit), values
 
 
 def facts(recording: Recording) -> Facts:

@@ -71,7 +71,6 @@ class TestOptions:
         ({**READS, "input": "AI9"}, "input must be one that Advantech ADAM-6217 has"),
         ({"reader": {"profile": "adam_6217"}, "input": "AI0"}, "both are unit 1"),
         ({**READS, "reader": {"profile": "kepco_bop"}}, "another protocol"),
-        ({**READS, "output": "AI0", "profile": "adam_6217"}, "output must be one that"),
         ({**READS, "reader": {**READER, "serial_port": "/dev/r"}}, "TCP: give reader.host"),
     ])  # fmt: skip
     def test_options_that_do_not_go_with_the_profile(self, changes, words):

@@ -11,7 +11,7 @@ import pytest
 from serial.tools.list_ports_common import ListPortInfo
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.transport import resource_names, stream_link
+from hilctl_drivers.transport import resource_names, serial_port, stream_link
 from hilctl_drivers.transport.links import LostError
 from hilctl_drivers.transport.resource_names import held_address, held_port
 from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
@@ -176,14 +176,14 @@ def test_a_port_is_known_by_its_number_too(line):
     assert number in held_port(f"/proc/self/root{path}")
 
 
-def test_a_port_whose_path_leads_to_another_device_is_not_opened(line):
+def test_a_port_whose_path_leads_to_another_device_is_not_opened(line, monkeypatch):
     """A guardian that retries would send its value to whatever was plugged in since."""
     _, path = line
     link = SerialLink(path, SerialSettings(), QUICK_S)
     link.open()
     link.open()
     link.close()
-    Path(path).chmod(0o600)  # changes the time that tells a new pty from an old one
+    monkeypatch.setattr(serial_port, "port_identity", lambda path: "another")
     with pytest.raises(LostError, match="another device"):
         link.open()
 
