@@ -84,6 +84,19 @@ def loop_figures(recording: Recording, segment: Segment) -> LoopFigures:
     )
 
 
+def centre_line(loop: LoopFigures) -> F64:
+    """Return the mean command of both branches at even steps of the displacement: float64[k]."""
+    first = int(loop.displacement_um.argmin())
+    command, y = np.roll(loop.command, -first), np.roll(loop.displacement_um, -first)
+    turn = int(y.argmax())
+    steps = np.linspace(y[0], y[turn], _POINTS)
+    rising, falling = (
+        np.interp(steps, np.maximum.accumulate(y[branch]), command[branch])
+        for branch in (slice(0, turn + 1), slice(None, turn - 1, -1))
+    )
+    return np.asarray(0.5 * (rising + falling))
+
+
 def all_loops(recording: Recording) -> tuple[LoopFigures, ...]:
     """Evaluate every periodic segment."""
     return tuple(loop_figures(recording, each) for each in recording.segments if each.period > 0.0)

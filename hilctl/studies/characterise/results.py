@@ -169,7 +169,7 @@ def _is_signal(value: Any) -> bool:
 
 _SLACK = 0.01
 
-FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "training")
+FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "settled-loops", "training")
 """Steps for identification. Each starts with a motion of full amplitude, which erases the earlier
 history."""
 

@@ -12,6 +12,7 @@ from hilctl.studies.characterise import waveforms
 from hilctl.studies.characterise.limits import CharacterisationLimits as Limits
 from hilctl.studies.characterise.loops import (
     all_loops,
+    centre_line,
     loop_figures,
     next_amplitude,
     repeatability,
@@ -213,6 +214,12 @@ def _fast(limits: Limits, measured: Measured) -> Keys:
     return waveforms.fast_loops(limits, amplitudes)
 
 
+def _settled(limits: Limits, measured: Measured) -> Keys:
+    full, loops = full_amplitude(limits, measured), measured.growing
+    straight = np.array([limits.centre - full, limits.centre + full])
+    return waveforms.settled_loops(limits, full, centre_line(loops[-1]) if loops else straight)
+
+
 def _take_slow(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     loops = all_loops(recording)
     largest = max(loops, key=lambda each: each.amplitude)
@@ -297,6 +304,7 @@ _ROWS: list[_Row] = [
     ("creep", "creep at both ends of the range", _at_full(waveforms.rests), _take_creep),
     ("small-motions", "small random motions", _at_full(waveforms.small_motions),
      _unevaluated("for the fit")),
+    ("settled-loops", "small loops up to both ends", _settled, _unevaluated("for the fit")),
     ("training", "random reference for the fit", _random(waveforms.TRAINING_SEED),
      _unevaluated("for the fit")),
     ("held-out", "random reference for the validation", _random(waveforms.HELD_OUT_SEED),

@@ -5,6 +5,7 @@ import math
 from pathlib import Path
 from typing import Any, TypeAlias
 
+import numpy as np
 from pydantic import TypeAdapter
 
 from hilctl.base.types import F64
@@ -37,6 +38,11 @@ _TRIES = 5
 _OF_BIAS = 0.15
 _OF_REST = 0.8
 _SMALL = ((0.6, 0.35), (-0.6, 0.35), (0.0, 0.35), (0.87, 0.11), (-0.87, 0.11), (0.0, 0.11))
+_SETTLED = (
+    (0.1, (-0.9, -0.45, 0.0, 0.45, 0.9)),
+    (0.25, (-0.75, -0.375, 0.0, 0.375, 0.75)),
+)
+"""Amplitudes of loops that settle, of half the stroke, and their places about its middle."""
 _RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
 
 
@@ -187,6 +193,22 @@ def biased_loops(limits: CharacterisationLimits, amplitude: float) -> Keys:
         sine(limits, small, limits.middle_hz, 4.0, offset=limits.centre + part * amplitude)
         for part in _BIASES
     )
+    return _conditioned(limits, amplitude, *parts)
+
+
+def settled_loops(limits: CharacterisationLimits, amplitude: float, line: F64) -> Keys:
+    """Return small loops of two sizes and frequencies up to both ends, after conditioning.
+
+    ``line`` are commands at even steps of the displacement over the whole stroke, float64[k].
+    """
+    # A small loop drifts in its first cycles. Random motions do not show where it settles.
+    stroke = np.linspace(-1.0, 1.0, line.size)
+    parts = []
+    for hz in (limits.middle_hz, _RANDOM_BAND[1] * limits.highest_hz):
+        for size, places in _SETTLED:
+            for place in places:
+                low, high = np.interp([place - size, place + size], stroke, line).tolist()
+                parts.append(sine(limits, 0.5 * (high - low), hz, 4.0, offset=0.5 * (low + high)))
     return _conditioned(limits, amplitude, *parts)
 
 

@@ -11,6 +11,7 @@ from hilctl.base.segments import Segment
 from hilctl.studies.characterise.loops import (
     LoopFigures,
     all_loops,
+    centre_line,
     loop_figures,
     next_amplitude,
     repeatability,
@@ -36,6 +37,14 @@ def test_figures_of_a_loop(limits, played):
     assert found.gain_um == pytest.approx(7.4, rel=0.01)
     assert found.hysteresis_percent == pytest.approx(100.0 * (2 * 0.3 * 4 + 2 * 2) / 29.6, rel=0.03)
     assert found.scatter_percent < 0.1
+
+
+def test_the_centre_line_is_the_mean_of_both_branches(limits, played):
+    """Those of plays are symmetric, and the largest loop of them turns at +-2 A."""
+    line = centre_line(loop(limits, played, noise_um=0.0))
+    assert (line[0], line[-1]) == pytest.approx((-2.0, 2.0), abs=0.01)
+    assert line == pytest.approx(-line[::-1], abs=0.02)
+    assert np.all(np.diff(line) > 0.0)
 
 
 def test_cycles_that_differ_scatter(limits, played):

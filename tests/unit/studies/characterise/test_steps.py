@@ -44,7 +44,7 @@ def test_a_sound_actuator_goes_through_all_steps(walked, limits):
     assert names == [
         "rest", "polarity-1", "response-1", *(f"growing-{k}" for k in range(1, 6)), "slow-loops",
         "fast-loops", "reversal-curves", "biased-loops", "creep", "small-motions",
-        "training", "held-out", "repeated",
+        "settled-loops", "training", "held-out", "repeated",
     ]  # fmt: skip
     assert measured.reaction.amplitude == pytest.approx(0.01 * limits.reach, rel=1e-3)
     amplitudes = [each.amplitude for each in measured.growing]

@@ -22,6 +22,7 @@ WAVEFORMS = {
     "fast": lambda x: w.fast_loops(x, dict.fromkeys(w.frequencies_hz(x), x.reach)),
     "reversal": lambda x: w.reversal_curves(x, x.reach),
     "biased": lambda x: w.biased_loops(x, x.reach),
+    "settled": lambda x: w.settled_loops(x, x.reach, np.array([x.low, x.high])),
     "random": lambda x: w.random_reference(x, x.reach, 1),
     "rests": lambda x: w.rests(x, x.reach),
     "small": lambda x: w.small_motions(x, x.reach),
@@ -53,6 +54,16 @@ def test_the_multisine_has_whole_periods(limits):
 def test_the_largest_of_the_slow_loops_comes_first(limits):
     amplitudes = [part["amplitude"] for part in w.slow_loops(limits, 2.0)["parts"]]
     assert amplitudes == [2.0, 1.5, 1.0, 0.5]
+
+
+def test_settled_loops_are_spread_over_the_displacement(limits):
+    """The displacement of this actuator is the square root of the command above the lowest."""
+    line = np.linspace(0.0, 1.0, 201) ** 2
+    loops = w.settled_loops(limits, 1.0, line)["parts"][1:]
+    ends = np.array([(x["offset"] - x["amplitude"], x["offset"] + x["amplitude"]) for x in loops])
+    low, high = np.sqrt(np.maximum(ends, 0.0)).T
+    assert sorted(set(np.round(high - low, 2))) == [0.1, 0.25]
+    assert (low.min(), high.max()) == pytest.approx((0.0, 1.0), abs=1e-3)
 
 
 def test_reversal_curves_turn_ever_lower(limits):
