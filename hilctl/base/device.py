@@ -4,17 +4,50 @@ Devices implement :class:`Device` in ``hilctl_drivers`` or in other packages;
 :mod:`hilctl.loop.pacer` and the tests implement clocks.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hilctl.base.errors import InputError
-from hilctl.base.strict import StrictModel
+from hilctl.base.strict import Field, StrictModel
 from hilctl.base.types import F64, CommandUnit
 
 
 class DeviceOptions(StrictModel):
     """Base of a device's own options in the experiment file: frozen, strict, no unknown keys."""
+
+
+class VoltageLimit(DeviceOptions):
+    """Largest voltage u of an amplifier that drives a coil: u = R i + L di/dt.
+
+    The voltages that moving rods induce are omitted.
+    """
+
+    voltage_max_v: float = Field(gt=0.0, le=1e3, description="largest voltage either way, V")
+    resistance_ohm: float = Field(gt=0.0, le=1e3, description="resistance of the coil, ohm")
+    inductance_h: float = Field(gt=0.0, le=10.0, description="inductance of the coil, H")
+    bandwidth_hz: float | None = Field(
+        default=None, ge=1.0, le=1e6, description="corner of the first-order current loop, Hz"
+    )
+
+    @property
+    def held_a(self) -> float:
+        """Current that the largest voltage holds, in A."""
+        return self.voltage_max_v / self.resistance_ohm
+
+    def decay(self, seconds: float) -> float:
+        """Return the remaining part of a current that nothing drives."""
+        return math.exp(-self.resistance_ohm / self.inductance_h * seconds)
+
+    def voltage_v(self, current_a: F64, period_s: float) -> F64:
+        """Return the constant voltage that moves a current in one period, in V.
+
+        ``current_a`` is float64[n + 1]; float64[n] is returned, from each current to the next.
+        """
+        moved = -math.expm1(-self.resistance_ohm / self.inductance_h * period_s)
+        before = current_a[:-1]
+        return self.resistance_ohm * (before + (current_a[1:] - before) / moved)
 
 
 @dataclass(frozen=True, slots=True)

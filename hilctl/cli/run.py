@@ -283,6 +283,8 @@ def print_forecast(checked: CheckedExperiment) -> None:
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
         "recording": _recording(forecast.recording_mb),
     }
+    if config.amplifier is not None and forecast.voltage_v is not None:
+        rows["voltage"] = f"{forecast.voltage_v:.4g} V (limit {config.amplifier.voltage_max_v:g})"
     if (expected := checked.expected) is not None:
         rows["model error"] = (
             f"up to {expected.percent:.2g} % of a motion's peak-to-peak at {expected.stroke}"

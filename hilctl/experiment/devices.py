@@ -9,6 +9,7 @@ The guardian imports this module, so it must not import numba.
 """
 
 from collections.abc import Callable
+from contextlib import suppress
 from dataclasses import asdict, dataclass
 from importlib import import_module
 from importlib.metadata import entry_points
@@ -16,7 +17,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any, NamedTuple, cast
 
-from hilctl.base.device import Device, complete
+from hilctl.base.device import Device, VoltageLimit, complete
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
@@ -80,7 +81,10 @@ def made_device(document: Document, folder: Path, files: TextFiles) -> Device | 
         chosen = device_class(kind)
     except InputError as error:
         raise ConfigError([ConfigProblem(where, "device.kind", str(error))]) from None
-    context = {"folder": folder, "files": files}
+    context: dict[str, object] = {"folder": folder, "files": files}
+    if "amplifier" in document.data:
+        with suppress(ConfigError):  # an invalid one is reported as a key of the experiment
+            context["amplifier"] = document.validate(VoltageLimit, at=("amplifier",))
     options = document.validate(chosen.Options, at=("device",), without=("kind",), context=context)
     try:
         return complete(chosen(options))

@@ -3,7 +3,7 @@
 import json
 from typing import Annotated, Any, Literal
 
-from hilctl.base.device import DeviceOptions
+from hilctl.base.device import DeviceOptions, VoltageLimit
 from hilctl.base.strict import BeforeValidator, Field, StrictModel
 from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.sections import (
@@ -78,6 +78,8 @@ class Experiment(StrictModel):
         description: Purpose in words.
         labels: Labels for searches of runs, such as operator, sample or temperature.
         device: ``kind`` and the device's own options.
+        amplifier: Largest voltage of the amplifier that drives the coil, for devices driven in A.
+            A run that needs more is refused. Default: not checked.
         sample_rate_hz: Samples per second.
         block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
         waveform: The reference.
@@ -96,6 +98,7 @@ class Experiment(StrictModel):
     description: str = ""
     labels: Labels = Field(default_factory=dict)
     device: dict[str, Any]
+    amplifier: VoltageLimit | None = None
     sample_rate_hz: Annotated[float, Field(ge=1e-3, le=1e6)]
     block: Annotated[int, Field(ge=1, le=4096)] = 1
     waveform: AnyWaveform

@@ -16,6 +16,7 @@ from hilctl.experiment.coil_heat import CoilHeat, RunHeat
 from hilctl.experiment.device_state import CompensatorStart
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.kernels.dynamics import lag_block
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import LinearBypass
 from hilctl.waveforms.build import Reference, RepeatedPart
@@ -52,6 +53,8 @@ class Forecast:
     lowest_at_s: float  # time of the lowest command, from the start of the conditioning
     highest_at_s: float
     fastest_at_s: float
+    voltage_v: float | None  # largest voltage of the amplifier; None without its limit
+    voltage_at_s: float
     heat: RunHeat  # effect on the heat of the coil, whatever the heat before
     begins_rms_a: float | None  # running rms after the last run; None without a thermal budget
     heating_rms_a: float | None  # highest running rms of the coil current; None without a budget
@@ -104,7 +107,7 @@ def forecast_of(
     )
     low, high = reference.span
     command, heat = figures.command, figures.command.heat
-    lowest_at_s, highest_at_s, fastest_at_s = command.places_s
+    lowest_at_s, highest_at_s, fastest_at_s, voltage_at_s = command.places_s
     return Forecast(
         samples=values.size,
         duration_s=values.size / config.sample_rate_hz,
@@ -119,6 +122,8 @@ def forecast_of(
         lowest_at_s=lowest_at_s,
         highest_at_s=highest_at_s,
         fastest_at_s=fastest_at_s,
+        voltage_v=None if config.amplifier is None else command.voltage_v,
+        voltage_at_s=voltage_at_s,
         heat=figures.heat,
         begins_rms_a=None if heat.rms_a is None else math.sqrt(heat_a2),
         heating_rms_a=heat.rms_a,
@@ -212,10 +217,11 @@ def whole_cycle(period: float, samples: int) -> int:
 
 
 class CommandFigures:
-    """Range, slew and heat of consecutive commands.
+    """Range, slew, voltage and heat of consecutive commands.
 
     Attributes:
         last: Command before the next ones.
+        voltage_v: Largest magnitude of the amplifier's voltage; 0 without its limit.
     """
 
     def __init__(self, config: Experiment, last: float, heat_a2: float) -> None:
@@ -225,23 +231,43 @@ class CommandFigures:
         self._rate_hz = config.sample_rate_hz
         self._step = 0.0
         self._samples = 0
-        self._places = [0, 0, 0]  # samples of the lowest, highest and fastest command
+        self._amplifier = config.amplifier
+        self._current = last
+        self._lag = np.full(2, last)  # memory of the current loop
+        self.voltage_v = 0.0
+        self._places = [0, 0, 0, 0]  # samples of lowest, highest, fastest command, largest voltage
 
     def add(self, command: F64) -> None:
         """Add the next commands: float64[n], n > 0."""
         with np.errstate(over="ignore", invalid="ignore"):  # such commands are rejected later
             steps = np.abs(np.diff(command, prepend=self.last))
-        places = int(command.argmin()), int(command.argmax()), int(steps.argmax())
-        before = self.low, self.high, self._step
+            voltages = self._voltages(command)
+        found = command.argmin(), command.argmax(), steps.argmax(), voltages.argmax()
+        places = [int(place) for place in found]
+        before = self.low, self.high, self._step, self.voltage_v
         self.low = float(np.minimum(self.low, command[places[0]]))  # keeps a NaN, unlike min()
         self.high = float(np.maximum(self.high, command[places[1]]))
         self._step = float(np.maximum(self._step, steps[places[2]]))
-        for i, now in enumerate((self.low, self.high, self._step)):
+        self.voltage_v = float(np.maximum(self.voltage_v, voltages[places[3]]))
+        for i, now in enumerate((self.low, self.high, self._step, self.voltage_v)):
             if now != before[i]:
                 self._places[i] = self._samples + places[i]
         self.last = float(command[-1])
         self.heat.add(command)
         self._samples += command.size
+
+    def _voltages(self, command: F64) -> F64:
+        """Return the magnitude of the amplifier's voltage after each command; 0 without a limit."""
+        amplifier, current = self._amplifier, command
+        if amplifier is None:
+            return np.zeros(command.size)
+        if amplifier.bandwidth_hz is not None:
+            current = np.empty(command.size)
+            periods = 2.0 * math.pi * amplifier.bandwidth_hz / self._rate_hz
+            lag_block(command, periods, 0.0, self._lag, current)
+        currents = np.append(self._current, current)
+        self._current = float(current[-1])
+        return np.abs(amplifier.voltage_v(currents, 1.0 / self._rate_hz))
 
     def skip(self, heat_a2: float, samples: int, times: int) -> None:
         """Add the last ``samples`` ``times`` more times; the heat before them was ``heat_a2``."""
@@ -249,10 +275,10 @@ class CommandFigures:
         self._samples += samples * times
 
     @property
-    def places_s(self) -> tuple[float, float, float]:
-        """Times of the lowest, the highest and the fastest command, in s."""
-        low, high, fast = (place / self._rate_hz for place in self._places)
-        return low, high, fast
+    def places_s(self) -> tuple[float, float, float, float]:
+        """Times of the lowest, highest and fastest command and of the largest voltage, in s."""
+        low, high, fast, voltage = (place / self._rate_hz for place in self._places)
+        return low, high, fast, voltage
 
     @property
     def slew_per_s(self) -> float:

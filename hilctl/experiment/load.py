@@ -135,7 +135,7 @@ def _joint_problems(config: Experiment, document: Document) -> list[ConfigProble
     """Return broken rules between sections of the experiment."""
     found: list[ConfigProblem] = []
 
-    def add(loc: tuple[str, str], rule: str, value: object = "", hint: str = "") -> None:
+    def add(loc: tuple[str, ...], rule: str, value: object = "", hint: str = "") -> None:
         found.append(ConfigProblem(document.where(loc), ".".join(loc), rule, str(value), hint))
 
     unit, limits = config.waveform.unit, config.limits
@@ -146,6 +146,8 @@ def _joint_problems(config: Experiment, document: Document) -> list[ConfigProble
     elif config.compensator is None and unit != limits.unit:
         rule = f"must be {limits.unit}, the unit of the limits, without a compensator"
         add(("waveform", "unit"), rule, unit)
+    if config.amplifier is not None and limits.unit != "A":
+        add(("amplifier",), "is for a device driven in A", hint="remove it")
     low, high = limits.command_range
     if not low <= config.safe.value <= high:
         rule = f"must lie within the limits, {low:g} to {high:g} {limits.unit}"

@@ -51,6 +51,7 @@ _ROUNDING = 1e-9  # of the range of commands
 _MORE_SLOPE = 1.5  # of a loop at its ends, than on average
 _RANGE_SLACK = 0.002  # of the range that a model was identified on
 _SOFT_SHARE = 0.25  # of the slew limit, for a soft start
+_SLOWER = "lower frequency or amplitude, soften jumps (soft_start_s, soft_end_s, rise_s)"
 
 
 @shown_briefly
@@ -294,12 +295,37 @@ def command_problems(
         times = forecast.slew_per_s / limits.slew_per_s
         place, _ = _place(loaded, reference, forecast, forecast.fastest_at_s)
         hint = (
-            f"{times:.3g} times the limit{place}: lower frequency or amplitude, soften jumps "
-            f"(soft_start_s, soft_end_s, rise_s), or raise {key} to {_up(forecast.slew_per_s):g}"
+            f"{times:.3g} times the limit{place}: {_SLOWER}, "
+            f"or raise {key} to {_up(forecast.slew_per_s):g}"
         )
         rule = f"the run must change no faster than {limits.slew_per_s:g} {unit}/s"
         found.append(loaded.problem(key, rule, f"{forecast.slew_per_s:.6g}", hint))
+    found += _voltage_problems(loaded, forecast, reference)
     return [*found, *_budget_problems(loaded, forecast)]
+
+
+def _voltage_problems(
+    loaded: LoadedExperiment, forecast: Forecast, reference: Reference | None
+) -> Iterator[ConfigProblem]:
+    amplifier, needed_v, at_s = loaded.config.amplifier, forecast.voltage_v, forecast.voltage_at_s
+    if amplifier is None or needed_v is None or needed_v <= amplifier.voltage_max_v:
+        return
+    low, high = forecast.command_min, forecast.command_max
+    excess_v, cure = needed_v - amplifier.voltage_max_v, _SLOWER
+    if at_s < forecast.before_s:
+        cure = "lower the condition's frequency_hz or amplitude_a"
+    elif max(-low, high) > amplifier.held_a:
+        held = f"{amplifier.voltage_max_v:g} V hold at most {amplifier.held_a:.4g} A"
+        cure = f"lower amplitude or offset, because {held}"
+    elif at_s > forecast.before_s:  # not the step to the first command
+        # The voltage of the mean command does not decrease with the amplitude.
+        alternating_v = needed_v - amplifier.resistance_ohm * abs(0.5 * (low + high))
+        if smaller := _smaller(loaded, forecast, 0.5 * (high - low) * excess_v / alternating_v):
+            cure = f"lower the frequency, {smaller}"
+    place, _ = _place(loaded, reference, forecast, at_s)
+    hint = f"{excess_v:.3g} V too much{place}: {cure}, or use an amplifier of {_up(needed_v):g} V"
+    rule = f"the run must need no more than {amplifier.voltage_max_v:g} V"
+    yield loaded.problem("amplifier.voltage_max_v", rule, f"{needed_v:.4g} V", hint)
 
 
 def _wider(loaded: LoadedExperiment, forecast: Forecast) -> str:

@@ -87,7 +87,7 @@ def wired_experiment(
         reader_line=_line(reader),
         reader_unit_id=reader.unit_id if reader else None,
         reader_port=_port(reader),
-        actuator=_actuator(unit, actuator),
+        actuator=_actuator(unit, actuator, document.data.get("amplifier")),
         wiring=(options.amplifier, options.sensor),
     )
     return WiredExperiment(path, section, made)
@@ -118,8 +118,10 @@ def _line(reader: AddressOptions | None) -> Any:
     return "own" if apart else "same"
 
 
-def _actuator(unit: CommandUnit, settings: Sequence[str]) -> SimulatedOptions:
-    """Return the options of the simulated actuator that is driven with a unit."""
+def _actuator(
+    unit: CommandUnit, settings: Sequence[str], amplifier: Any = None
+) -> SimulatedOptions:
+    """Return the options of the actuator with a unit; ``amplifier`` is the experiment's section."""
     document = Document("--actuator", "{}")
     for each in settings:
         document.set(each, "--actuator")
@@ -130,7 +132,7 @@ def _actuator(unit: CommandUnit, settings: Sequence[str]) -> SimulatedOptions:
     ]
     if of_device:
         raise ConfigError(of_device)
-    return document.validate(ACTUATORS[unit][0])
+    return document.validate(ACTUATORS[unit][0], context={"amplifier": amplifier})
 
 
 def _link(options: AddressOptions) -> LinkKind | None:

@@ -11,9 +11,15 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 
-from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.device import DeviceInfo, DeviceOptions, VoltageLimit
 from hilctl.base.errors import DeviceError
-from hilctl.base.strict import Field, StrictModel, model_validator
+from hilctl.base.strict import (
+    Field,
+    StrictModel,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from hilctl.base.types import F64
 from hilctl_drivers.device import DacDevice, details_of
 from hilctl_drivers.simulated.actuator_base import Plant, RodParameters
@@ -28,7 +34,6 @@ from hilctl_drivers.simulated.terfenol import (
     TerfenolActuator,
     TerfenolParameters,
     Thermal,
-    VoltageLimit,
 )
 from hilctl_drivers.simulated.thermal_switching import SwitchingParameters
 
@@ -255,8 +260,15 @@ class TerfenolOptions(SimulatedOptions):
         default=None, description="a mode of the structure beside the first"
     )
     amplifier: VoltageLimit | None = Field(
-        default=None, description="limit of the amplifier's voltage"
+        default=None,
+        validate_default=True,
+        description="limit of the amplifier's voltage; default: that of the experiment",
     )
+
+    @field_validator("amplifier", mode="before")
+    @classmethod
+    def _of_experiment(cls, value: Any, info: ValidationInfo) -> Any:
+        return (info.context or {}).get("amplifier") if value is None else value
 
     @model_validator(mode="after")
     def _room(self) -> Self:

@@ -13,7 +13,7 @@ from typing import Annotated, TypeAlias
 
 import numpy as np
 
-from hilctl.base.device import DeviceOptions
+from hilctl.base.device import DeviceOptions, VoltageLimit
 from hilctl.base.strict import Field
 from hilctl.base.types import F64
 from hilctl.kernels.jit import ensure_compiled, kernel
@@ -160,17 +160,6 @@ class SecondMode(DeviceOptions):
     )
 
 
-class VoltageLimit(DeviceOptions):
-    """A limit of the amplifier's voltage, which limits the slew of the current.
-
-    The voltages that moving rods induce are omitted.
-    """
-
-    voltage_max_v: float = Field(gt=0.0, le=1e3, description="largest voltage either way, V")
-    resistance_ohm: float = Field(gt=0.0, le=1e3, description="resistance of the coil, ohm")
-    inductance_h: float = Field(gt=0.0, le=10.0, description="inductance of the coil, H")
-
-
 @dataclass(frozen=True, slots=True)
 class TerfenolParameters:
     """Constants of the actuator, its amplifier, DAC, sensor and ADC.
@@ -214,13 +203,13 @@ def _modes(parameters: TerfenolParameters, load_kg: float) -> list[Mode]:
 
 def _amplifier(parameters: TerfenolParameters, step_s: float) -> Amplification:
     """Return the constants of ``amplify``."""
-    bandwidth = 2.0 * math.pi * parameters.amplifier_bandwidth_hz
+    bandwidth_hz = parameters.amplifier_bandwidth_hz
     decay_half, decay, most = 0.0, 0.0, math.inf
     limit = parameters.amplifier
     if limit is not None:
-        rate = limit.resistance_ohm / limit.inductance_h
-        decay_half, decay = math.exp(-0.5 * rate * step_s), math.exp(-rate * step_s)
-        most = limit.voltage_max_v / limit.resistance_ohm
+        decay_half, decay, most = limit.decay(0.5 * step_s), limit.decay(step_s), limit.held_a
+        bandwidth_hz = limit.bandwidth_hz or bandwidth_hz
+    bandwidth = 2.0 * math.pi * bandwidth_hz
     return (
         math.exp(-0.5 * bandwidth * step_s),
         math.exp(-bandwidth * step_s),

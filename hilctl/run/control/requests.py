@@ -146,6 +146,7 @@ def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, byp
         command_min=float(np.min(commands)),  # keeps a NaN, where min() would not
         command_max=float(np.max(commands)),
         slew_per_s=0.0,
+        voltage_v=None,
         budget_used_s=None,
     )
     problems += command_problems(checked.loaded, bound)

@@ -77,13 +77,15 @@ class CharacterisationLimits:
         return math.pi * travel / (2.0 * _OF_SLEW_TO_START * self.loaded.config.limits.slew_per_s)
 
     def scale(self, values: F64) -> float:
-        """Return the factor, <= 1, that keeps commands within slew and heat with a margin."""
+        """Return the factor, <= 1, that keeps commands within slew, voltage and heat."""
         config = self.loaded.config
         figures = CommandFigures(config, self.rest, self.rest**2)
         figures.add(values)
         scale = 1.0
         if figures.slew_per_s > 0.0:
             scale = min(scale, _NEARLY * config.limits.slew_per_s / figures.slew_per_s)
+        if config.amplifier is not None and figures.voltage_v > 0.0:
+            scale = min(scale, _NEARLY * config.amplifier.voltage_max_v / figures.voltage_v)
         budget_a, rms_a = config.limits.rms_current_a, figures.heat.rms_a
         if budget_a is not None and rms_a:
             scale = min(scale, _OF_HEAT * budget_a / rms_a)

@@ -30,6 +30,16 @@ def test_what_is_wrong_elsewhere_in_the_file_is_not_in_the_way(tmp_path):
 
 
 @pytest.mark.parametrize(
+    ("own", "voltage_max_v"), [("", 36.0), (", amplifier: {voltage_max_v: 20.0, %s}", 20.0)]
+)
+def test_a_simulated_rig_has_the_experiment_s_amplifier(tmp_path, own, voltage_max_v):
+    coil = "resistance_ohm: 4.0, inductance_h: 0.003"
+    text = "amplifier: {voltage_max_v: 36.0, %s}\ndevice: {kind: simulated_terfenol" + own + "}"
+    details = made(text.replace("%s", coil), tmp_path).info.details
+    assert json.loads(details["amplifier"])["voltage_max_v"] == voltage_max_v
+
+
+@pytest.mark.parametrize(
     ("section", "words"),
     [("{}", "is required"), ("{kind: 3}", "must be text"), ("{kind: gone}", "unknown device")],
 )

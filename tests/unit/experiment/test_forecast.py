@@ -58,9 +58,9 @@ class TestForecast:
     @pytest.mark.parametrize("chunk", [1, 7, 1000, 9999, 10_000, 10_001])
     def test_chunks_change_nothing(self, monkeypatch, chunk):
         model = terfenol_rdpi()
-        whole = checked(DISPLACEMENT, model=model).forecast
+        whole = checked(DISPLACEMENT, AMPLIFIER, model=model).forecast
         monkeypatch.setattr("hilctl.experiment.forecast.CHUNK", chunk)
-        assert checked(DISPLACEMENT, model=model).forecast == whole
+        assert checked(DISPLACEMENT, AMPLIFIER, model=model).forecast == whole
 
     def test_what_is_fed_ahead_is_what_is_forecast(self):
         model = StagedModel.around(terfenol_rdpi(), lag=FieldLag(tau_s=2e-4), delay_s=3e-4)
@@ -78,6 +78,8 @@ class TestForecast:
         assert plain.begun.input_um is plain.reference.values
 
 
+AMPLIFIER = "amplifier={voltage_max_v: 90, resistance_ohm: 4, inductance_h: 5e-3, \
+bandwidth_hz: 300}"
 BUDGET = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=7.0")
 SEQUENCE = "waveform={kind: sequence, unit: A, repeat: 40, parts: [{kind: sine, \
 amplitude: 9.0, frequency_hz: 7.0, duration_s: 1.0, soft_start_s: 0.2, soft_end_s: 0.2}, \
@@ -114,13 +116,13 @@ def forecast(name, model, monkeypatch):
     monkeypatch.setattr(shapes, "LONG", 100_000)
     monkeypatch.setattr(command_simulation, "LONG", 100_000)
     monkeypatch.setattr(command_simulation, "_LEAST_CYCLE", 2000)
-    return checked(DISPLACEMENT, *LONG[name], *BUDGET, model=model).forecast
+    return checked(DISPLACEMENT, *LONG[name], *BUDGET, AMPLIFIER, model=model).forecast
 
 
 @pytest.mark.parametrize("model", MODELS.values(), ids=MODELS)
 @pytest.mark.parametrize("name", LONG)
 def test_it_is_that_of_the_whole(name, model, monkeypatch):
-    whole = asdict(checked(DISPLACEMENT, *LONG[name], *BUDGET, model=model).forecast)
+    whole = asdict(checked(DISPLACEMENT, *LONG[name], *BUDGET, AMPLIFIER, model=model).forecast)
     found = asdict(forecast(name, model, monkeypatch))
     plain: dict[str, Any] = {}
     for key in ("heat", "line"):

@@ -17,7 +17,7 @@ from hilctl.experiment.coil_heat import RunHeat
 from hilctl.experiment.correction import Correction, LearnedCycle, signature
 from hilctl.experiment.device_state import InitialState, left_by
 from hilctl.experiment.file import CompensatorConfig
-from hilctl.experiment.load import resolve
+from hilctl.experiment.load import load_experiment, resolve
 from hilctl.experiment.model_validity import UNKNOWN
 from hilctl.experiment.preflight import check, command_problems
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
@@ -26,6 +26,7 @@ from hilctl.models.plays import RdpiModel
 from tests.fakes import DESCRIBED, DescribedDevice
 from tests.published import piezo_ppi, terfenol_rdpi
 
+CONFIGS = Path(__file__).parents[3] / "configs"
 CURRENT = """\
 name: current
 device: {kind: simulated_terfenol}
@@ -221,6 +222,7 @@ VOLTS = (
     .replace("slew_a_per_s", "slew_v_per_s")
 )
 HEAT = ["limits.rms_current_a=3.5", "limits.thermal_time_constant_s=0.6"]
+VOLTAGE = "amplifier={voltage_max_v: 8.0, resistance_ohm: 1.0, inductance_h: 0.02}"
 ADVISED = re.compile(r"(?:set|raise) (\S+) to (\[.*?\]|[-\d.e+]+)")
 
 
@@ -254,6 +256,15 @@ ADVISED = re.compile(r"(?:set|raise) (\S+) to (\[.*?\]|[-\d.e+]+)")
          [["waveform.amplitude=8.5"]]),
         (DISPLACEMENT, ["limits.slew_a_per_s=1000.0", "waveform.soft_start_s=0"],
          {"offset_um": 20.0}, "set waveform.soft_start_s to", []),
+        (CURRENT, [VOLTAGE, "waveform.soft_start_s=0.3"], {}, "set waveform.amplitude to",
+         [["waveform.frequency_hz=5.0"], ["amplifier.voltage_max_v=10.2"]]),
+        (CURRENT, [VOLTAGE], {}, "soft_start_s",
+         [["waveform.soft_start_s=0.3", "waveform.amplitude=4.0"]]),
+        (CURRENT, [VOLTAGE, "amplifier.resistance_ohm=4.0", "waveform.soft_start_s=0.3"], {},
+         "2 A", [["waveform.amplitude=0.5"]]),
+        (CURRENT, [VOLTAGE, "waveform.amplitude=1.0", "waveform.soft_start_s=0.3",
+                   "condition={amplitude_a: 6.0}"], {},
+         "condition's", [["condition.frequency_hz=3.0"], ["condition.amplitude_a=3.0"]]),
     ],
 )  # fmt: skip
 def test_what_a_message_advises_passes_the_check(text, settings, given, advised, others):
@@ -266,6 +277,32 @@ def test_what_a_message_advises_passes_the_check(text, settings, given, advised,
     for cure in cures:
         instead = ["limits.peak_current_a=null"] if "limits.drive_a" in cure[0] else []
         checked(text, *settings, *cure, *instead, **given)
+
+
+@pytest.mark.parametrize(("bandwidth", "gain"), [("", 1.0), (", bandwidth_hz: 10.0", 0.5**0.5)])
+def test_voltage_is_that_of_resistance_and_inductance(bandwidth, gain):
+    """A current loop with its corner at the frequency of a sine leaves 0.71 of the amplitude."""
+    setting = VOLTAGE.replace("8.0", "15.0").replace("}", bandwidth + "}")
+    forecast = checked(CURRENT, setting, "waveform.soft_start_s=0.3").forecast
+    expected_v = 0.5 + gain * 6.0 * abs(1.0 + 0.02j * 2.0 * np.pi * 10.0)
+    assert forecast.voltage_v == pytest.approx(expected_v, rel=2e-3)
+    assert checked(CURRENT).forecast.voltage_v is None
+
+
+def test_full_stroke_at_250_hz_needs_more_than_36_v():
+    path = CONFIGS / "terfenol_sine_6a.yaml"
+    limit = "amplifier={{voltage_max_v: {}, resistance_ohm: 4.0, inductance_h: 3.0e-3}}".format
+    settings = ["waveform.frequency_hz=250", "waveform.duration_s=0.5"]
+    check(load_experiment(path, [*settings, limit(72.0)]))
+    (found,) = refused(load_experiment(path, [*settings, limit(36.0)]))
+    assert (found.key, found.value) == ("amplifier.voltage_max_v", "54.35 V")
+    assert "0.2005 s" in found.hint
+
+
+def test_an_amplifier_is_for_a_device_driven_in_current():
+    with pytest.raises(ConfigError) as caught:
+        load_experiment(CONFIGS / "piezo_sine.yaml", [VOLTAGE])
+    assert [problem.key for problem in caught.value.problems] == ["amplifier"]
 
 
 class TestBudget:

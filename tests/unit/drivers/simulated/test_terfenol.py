@@ -13,6 +13,7 @@ import pytest
 from pydantic import ValidationError
 from scipy.signal import StateSpace, lsim
 
+from hilctl.base.device import VoltageLimit
 from hilctl_drivers.simulated import terfenol
 from hilctl_drivers.simulated.devices import PHYSICS, SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
@@ -294,6 +295,9 @@ class TestSecondMode:
         assert -decay == pytest.approx(0.02, rel=0.05)
 
 
+STEP = np.full(200, 0.5)
+
+
 class TestVoltageLimit:
     LIMIT: ClassVar = {"voltage_max_v": 60.0, "resistance_ohm": 4.0, "inductance_h": 5e-3}
 
@@ -317,6 +321,18 @@ class TestVoltageLimit:
         weak = self.LIMIT | {"voltage_max_v": 12.0}
         current_a = run_both(actuator(amplifier=weak), np.full(2000, -9.0))[1]
         assert current_a[-1] == pytest.approx(-3.0, abs=4e-4)
+
+    def test_the_voltage_of_a_driven_current_is_the_largest(self):
+        limit = VoltageLimit.model_validate(self.LIMIT)
+        decay = limit.decay(1e-3)
+        current_a = np.array([2.0, 2.0 * decay + limit.held_a * (1.0 - decay)])
+        assert limit.voltage_v(current_a, 1e-3) == pytest.approx([60.0])
+
+    def test_bandwidth_is_that_of_the_current_loop(self):
+        current_a = run_both(actuator(amplifier=self.LIMIT | {"bandwidth_hz": 100.0}), STEP)[1]
+        time_s = np.arange(STEP.size) / RATE_HZ
+        expected_a = STEP[0] * -np.expm1(-2.0 * np.pi * 100.0 * time_s)
+        np.testing.assert_allclose(current_a, expected_a, atol=4e-4)
 
     def test_small_signals_do_not_notice(self):
         """Where the voltage suffices the current is the unlimited one, bit for bit."""

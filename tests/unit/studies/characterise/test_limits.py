@@ -60,3 +60,9 @@ def test_commands_are_scaled_to_slew_and_heat(limits_with):
     assert 0.7 < heat < 1.0
     assert limits.scale(np.array([0.0, 2.0])) == pytest.approx(0.99 * 5000.0 / 10_000.0)
     assert limits.scale(np.array([0.0, 0.01])) == 1.0
+
+
+def test_commands_are_scaled_to_the_voltage(limits_with):
+    """4 A through 2 ohm, slowly."""
+    limits = limits_with("amplifier={voltage_max_v: 4.0, resistance_ohm: 2.0, inductance_h: 1e-3}")
+    assert limits.scale(np.linspace(0.0, 4.0, 50_000)) == pytest.approx(0.99 * 0.5, rel=1e-3)
