@@ -294,7 +294,7 @@ class _SegmentFigures:
         self._segment, self._compensated = segment, compensated
         self._start, self._stop, cycles = segment.steady_cycles()
         self._folding = CycleAverager(segment.period, 2) if cycles else None
-        self._lowest_um, self._highest_um = math.inf, -math.inf
+        self._lowest, self._highest = np.full(2, np.inf), np.full(2, -np.inf)  # input, output
         self._peak_um = self._squares_um2 = 0.0
         self._samples = 0
 
@@ -308,11 +308,12 @@ class _SegmentFigures:
         if self._folding:
             self._folding.add(part.index - self._segment.start, loop)
             return
-        loop_input, output = loop[:, np.isfinite(loop).all(axis=0)]
-        if output.size:
+        loop = loop[:, np.isfinite(loop).all(axis=0)]
+        if loop.size:
+            loop_input, output = loop
             error_um = output - loop_input
-            self._lowest_um = min(self._lowest_um, float(output.min()))
-            self._highest_um = max(self._highest_um, float(output.max()))
+            self._lowest = np.minimum(self._lowest, loop.min(axis=1))
+            self._highest = np.maximum(self._highest, loop.max(axis=1))
             self._peak_um = max(self._peak_um, float(np.abs(error_um).max()))
             self._squares_um2 += float(np.square(error_um).sum())
             self._samples += output.size
@@ -326,18 +327,24 @@ class _SegmentFigures:
             if cycle.whole:
                 loop_input, output = cycle.signals
                 error_um = output - loop_input
-                found = self._quality(peak_to_peak(output), peak(error_um), rms(error_um))
+                spans = peak_to_peak(loop_input), peak_to_peak(output)
+                found = self._quality(spans, peak(error_um), rms(error_um))
                 if self._segment.is_loop:
                     found["peak_hysteresis_percent"] = peak_hysteresis_percent(loop_input, output)
                     found["loop_area"] = loop_area(loop_input, output)
         elif self._samples:
             rms_um = math.sqrt(self._squares_um2 / self._samples)
-            found = self._quality(self._highest_um - self._lowest_um, self._peak_um, rms_um)
+            wanted_um, stroke_um = (self._highest - self._lowest).tolist()
+            found = self._quality((wanted_um, stroke_um), self._peak_um, rms_um)
         return {name: value for name, value in found.items() if value is not None}
 
-    def _quality(self, stroke_um: float, peak_um: float, rms_um: float) -> dict[str, float | None]:
+    def _quality(
+        self, spans: tuple[float, float], peak_um: float, rms_um: float
+    ) -> dict[str, float | None]:
+        """Return metrics; ``spans`` are the peak-to-peaks of the loop's input and output."""
+        wanted_um, stroke_um = spans
         found: dict[str, float | None] = {"peak_to_peak_um": stroke_um}
         if self._compensated:
-            found["peak_error_percent"] = percent(peak_um, stroke_um)
-            found["rms_error_percent"] = percent(rms_um, stroke_um)
+            found["peak_error_percent"] = percent(peak_um, wanted_um)
+            found["rms_error_percent"] = percent(rms_um, wanted_um)
         return found
