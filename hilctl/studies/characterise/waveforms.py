@@ -43,6 +43,7 @@ _SETTLED = (
     (0.25, (-0.75, -0.375, 0.0, 0.375, 0.75)),
 )
 """Amplitudes of loops that settle, of half the stroke, and their places about its middle."""
+_MOST_COMMAND = 3.0  # of a loop that settles, relative to the one in the middle
 _RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
 
 
@@ -206,9 +207,15 @@ def settled_loops(limits: CharacterisationLimits, amplitude: float, line: F64) -
     parts = []
     for hz in (limits.middle_hz, _RANDOM_BAND[1] * limits.highest_hz):
         for size, places in _SETTLED:
-            for place in places:
-                low, high = np.interp([place - size, place + size], stroke, line).tolist()
-                parts.append(sine(limits, 0.5 * (high - low), hz, 4.0, offset=0.5 * (low + high)))
+            ends = [np.interp([at - size, at + size], stroke, line).tolist() for at in places]
+            middle = ends[len(ends) // 2]
+            most = _MOST_COMMAND * (middle[1] - middle[0])
+            # A loop in saturation has other densities than a fit can have beside the rest.
+            parts += [
+                sine(limits, 0.5 * (high - low), hz, 4.0, offset=0.5 * (low + high))
+                for low, high in ends
+                if high - low <= most
+            ]
     return _conditioned(limits, amplitude, *parts)
 
 

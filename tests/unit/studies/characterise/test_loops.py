@@ -106,7 +106,7 @@ def test_growth_stops_short_of_the_stroke():
 
 
 def test_an_uneven_stroke_counts_on_its_narrow_side():
-    assert next_amplitude(grown((1.0, 10.0)), 9.0, (-100.0, 15.0)) < 1.2
+    assert next_amplitude(grown((1.0, 10.0)), 9.0, (-100.0, 17.0)) < 1.2
 
 
 def test_repeatability_tells_shape_from_place():
