@@ -98,6 +98,7 @@ class FakeInfo:
 
     measures_command: bool = False
     ages_readings: bool = False
+    corrects_readings: bool = False
     simulated: bool = False
     confirms: bool = True
     arm_s: float = 0.0

@@ -55,7 +55,9 @@ class DacSetup:
         there, here = reader.profile, writer.profile
         output = channel("output", options.output, here.outputs, here.title)
         sensor_input = channel("input", options.input, there.inputs, there.title)
-        chain = SignalChain(output, sensor_input, options.amplifier, options.sensor)
+        calibration = options.calibration_file
+        amplifier = None if calibration is None else calibration.content.amplifier
+        chain = SignalChain(output, sensor_input, options.amplifier, options.sensor, amplifier)
         measure = measuring_input(getattr(options, "measure", None), here.inputs, here.title)
         if measure is not None:
             chain.measured(measure)

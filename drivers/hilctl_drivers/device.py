@@ -11,13 +11,18 @@ import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping
 from dataclasses import replace
-from typing import TYPE_CHECKING, Any, ClassVar
+from pathlib import Path
+from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
+from pydantic import PlainSerializer, PlainValidator
 
+from hilctl.base.calibration import CalibrationFile, NamedCalibration
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError, UnconfirmedError
+from hilctl.base.files import TextFiles
 from hilctl.base.types import F64
+from hilctl.base.yaml import Document, option_file
 from hilctl_drivers.transport.wire_time import RateLimit
 
 if TYPE_CHECKING:  # it imports this module
@@ -40,6 +45,17 @@ class DacDevice(ABC):
     _reader: "SensorReader | None" = None
 
     def __init__(self, info: DeviceInfo, title: str, action: str, output: str) -> None:
+        self._curve: tuple[F64, F64] | None = None
+        self._step = self._exchange
+        self.reading_um: F64 = np.empty(0)
+        """Readings of the last exchange before their correction, if there is a calibration."""
+        if (calibration := info.calibration) is not None:
+            info = replace(info, files={**info.files, "calibration.yaml": calibration.text})
+            if sensor := calibration.content.sensor:
+                curve = sensor.curve(info.sensor_min_um, info.sensor_max_um)
+                low_um, high_um = curve[1][[0, -1]].tolist()
+                info = replace(info, sensor_min_um=low_um, sensor_max_um=high_um)
+                self._curve, self._step = curve, self._corrected_exchange
         self._info = info
         self._title = title
         self._action = action
@@ -121,7 +137,10 @@ class DacDevice(ABC):
         if self._block:
             raise self._error("look", "open")
         try:
-            return self._look()
+            displacement_um, output = self._look()
+            if self._curve is not None:
+                displacement_um = float(np.interp(displacement_um, *self._curve))
+            return displacement_um, output
         except DeviceError as error:
             raise self._error("look", str(error)) from None
         finally:
@@ -141,9 +160,21 @@ class DacDevice(ABC):
         if not self._in_range(command):
             raise self._out_of_range(command)
         try:
-            self._exchange(first_sample, command, displacement_um, measured)
+            self._step(first_sample, command, displacement_um, measured)
         except DeviceError as error:
             raise self._failed(self._action, error, self._abandon) from None
+
+    def _corrected_exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        """Exchange a block and correct its readings; one out of range becomes the range's end.
+
+        The sensor's range in :attr:`info` is the corrected one, so its ends are invalid readings.
+        """
+        assert self._curve is not None
+        self._exchange(first_sample, command, displacement_um, measured)
+        self.reading_um = displacement_um.copy()
+        displacement_um[:] = np.interp(displacement_um, *self._curve)
 
     def make_safe(self, command: float) -> None:
         """Set the output to ``command`` in one attempt and disconnect; the watchdog stays armed.
@@ -268,6 +299,20 @@ class DacDevice(ABC):
         unit = self._info.command_unit
         rule = f"{name} must be in [{self._low:g}, {self._high:g}] {unit}"
         return self._error(self._action, f"{rule}, got {command[index]} {unit}, nothing was sent")
+
+
+def _calibration(name: str, files: TextFiles | None, folder: Path | None) -> NamedCalibration:
+    path = (folder or Path()) / name
+    text = (files or TextFiles()).read(path)
+    return NamedCalibration(name, Document(str(path), text).validate(CalibrationFile), text)
+
+
+CalibrationName: TypeAlias = Annotated[
+    NamedCalibration,
+    PlainValidator(option_file(NamedCalibration, _calibration), json_schema_input_type=str),
+    PlainSerializer(lambda named: named.name, return_type=str),
+]
+"""An option that names a calibration file; it holds the calibration once it is validated."""
 
 
 def details_of(values: Mapping[str, Any]) -> dict[str, str]:

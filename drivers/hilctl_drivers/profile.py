@@ -12,22 +12,17 @@ from pathlib import Path
 from pkgutil import iter_modules, resolve_name
 from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
-from pydantic import PlainSerializer, PlainValidator, ValidationError, ValidationInfo
+from pydantic import PlainSerializer, PlainValidator, ValidationError
 from pydantic.json_schema import models_json_schema
-from pydantic_core import PydanticKnownError
 
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
-from hilctl.base.yaml import Document, broken_rules, loc_of
+from hilctl.base.yaml import Document, broken_rules, loc_of, option_file
 from hilctl_drivers.profile_base import BaseProfile
 
 FOLDER = Path(__file__).parent / "profiles"
 _Profile = TypeVar("_Profile", bound=BaseProfile)
-
-
-class BrokenProfileError(ConfigError, ValueError):
-    """A profile that options name breaks rules; a ``ValueError``: validation collects it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -37,33 +32,6 @@ class NamedProfile:
     name: str
     profile: BaseProfile
     text: str
-
-
-def _named(value: object, info: ValidationInfo) -> NamedProfile:
-    """Resolve a profile's name while options are validated.
-
-    The validation's context may have ``files``, which reads texts, and ``folder``, the base of
-    relative paths. So a run uses the checked text, also in another process.
-    """
-    if isinstance(value, NamedProfile):
-        return value
-    if not isinstance(value, str):
-        raise PydanticKnownError("string_type")
-    context = info.context or {}
-    try:
-        return _load(value, context.get("files"), context.get("folder", Path()))
-    except ConfigError as error:
-        raise BrokenProfileError(error.problems) from None
-    except InputError as error:
-        raise ValueError(str(error)) from None
-
-
-ProfileName: TypeAlias = Annotated[
-    NamedProfile,
-    PlainValidator(_named, json_schema_input_type=str),
-    PlainSerializer(lambda named: named.name, return_type=str),
-]
-"""An option that names a profile; it holds the profile too once it is validated."""
 
 
 @cache
@@ -118,6 +86,14 @@ def _load(name_or_path: str, files: TextFiles | None, folder: Path | None) -> Na
         )
     text = (files or TextFiles()).read(path)
     return NamedProfile(name_or_path, parse_profile(text, str(path)), text)
+
+
+ProfileName: TypeAlias = Annotated[
+    NamedProfile,
+    PlainValidator(option_file(NamedProfile, _load), json_schema_input_type=str),
+    PlainSerializer(lambda named: named.name, return_type=str),
+]
+"""An option that names a profile; it holds the profile too once it is validated."""
 
 
 def parse_profile(text: str, where: str) -> BaseProfile:

@@ -14,11 +14,12 @@ from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
+from hilctl.base.calibration import AmplifierCalibration, NamedCalibration
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
 from hilctl.base.types import F64, CommandUnit
-from hilctl_drivers.device import details_of
+from hilctl_drivers.device import CalibrationName, details_of
 from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_base import Range, Watchdog
 from hilctl_drivers.transport.wire_time import RateLimit
@@ -124,7 +125,7 @@ class Sensor(StrictModel):
 
 
 class Calibration(StrictModel):
-    """Calibration of gain and sensitivity; kept with each recording."""
+    """Calibration of gain and sensitivity, as a note that is kept with each recording."""
 
     date: str = Field(description="date of the calibration")
     by: str = Field(description="person who calibrated")
@@ -287,7 +288,9 @@ class DacOptions(AddressOptions):
     sensor: Sensor = Field(
         default=Sensor(), description="displacement sensor; may be omitted for a position"
     )
-    calibration: Calibration | None = Field(default=None, description="last calibration")
+    calibration: Calibration | CalibrationName | None = Field(
+        default=None, description="calibration file to apply, or a note on the last calibration"
+    )
     watchdog: WatchdogOptions | Literal["none"] = Field(
         description="the device's own; none if the device may hold its last output"
     )
@@ -310,6 +313,11 @@ class DacOptions(AddressOptions):
         """Output after a trip of the watchdog, as a command; 0 without one."""
         return 0.0 if self.watchdog == "none" else self.watchdog.safe_command
 
+    @property
+    def calibration_file(self) -> NamedCalibration | None:
+        """The calibration to apply."""
+        return self.calibration if isinstance(self.calibration, NamedCalibration) else None
+
     def details(self) -> dict[str, str]:
         """Return the options for a recording: texts, other values as JSON."""
         return details_of(self.model_dump(mode="json", exclude_none=True))
@@ -329,7 +337,12 @@ class SignalChain:
     """
 
     def __init__(
-        self, output: Range, sensor_input: Range, amplifier: Amplifier | None, sensor: Sensor
+        self,
+        output: Range,
+        sensor_input: Range,
+        amplifier: Amplifier | None,
+        sensor: Sensor,
+        calibrated: AmplifierCalibration | None = None,
     ) -> None:
         if amplifier is None and output.unit != "A":
             raise InputError(f"amplifier is required: the output is in {output.unit}")
@@ -341,6 +354,12 @@ class SignalChain:
         self._output_unit = output.unit
         self._gain = 1.0 if amplifier is None else amplifier.gain
         self._offset = 0.0 if amplifier is None else amplifier.offset
+        if calibrated is not None:
+            if calibrated.unit != self.command_unit:
+                rule = f"calibration: amplifier.unit must be {self.command_unit}"
+                raise InputError(f"{rule}, got {calibrated.unit}")
+            self._gain *= calibrated.gain
+            self._offset = self._offset * calibrated.gain + calibrated.offset
         self._um_per_unit = sensor.um_per_unit(sensor_input)
         self._offset_um = sensor.offset_um
         self.command_range = sorted(map(self.command, output.limits))
@@ -405,6 +424,7 @@ class SignalChain:
             max_rate_hz=rates.highest_hz,
             rate_note=rates.note,
             files=options.files(),
+            calibration=options.calibration_file,
             **more,
         )
 

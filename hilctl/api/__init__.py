@@ -27,7 +27,13 @@ from hilctl.base.errors import (
 )
 
 if TYPE_CHECKING:
-    from hilctl.api.campaigns import campaign, characterise, learn
+    from hilctl.api.campaigns import (
+        calibrate_amplifier,
+        calibrate_sensor,
+        campaign,
+        characterise,
+        learn,
+    )
     from hilctl.api.connection import RunConnection, connect
     from hilctl.api.models import LoadedModel, compare, export_model, identify, load_model, refine
     from hilctl.api.recordings import RecordedRun, export, list_runs, read, summarize
@@ -49,6 +55,8 @@ __all__ = [
     "RunTable",
     "SampleTable",
     "WrittenExperiment",
+    "calibrate_amplifier",
+    "calibrate_sensor",
     "campaign",
     "characterise",
     "check",
@@ -80,7 +88,13 @@ def __dir__() -> list[str]:
 
 if not TYPE_CHECKING:
     _OTHERS = {
-        "campaigns": {"campaign", "characterise", "learn"},
+        "campaigns": {
+            "calibrate_amplifier",
+            "calibrate_sensor",
+            "campaign",
+            "characterise",
+            "learn",
+        },
         "connection": {"RunConnection", "connect"},
         "models": {
             "LoadedModel",

@@ -1,13 +1,15 @@
-"""Run an experiment repeatedly: characterisation, campaigns, iterative learning."""
+"""Calibration, and repeated runs: characterisation, campaigns, iterative learning."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
 from dataclasses import replace
+from datetime import UTC, datetime
 from pathlib import Path
 
 from hilctl.api._types import PathLike, Settings, path_or_none, runs_folder, texts_of
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable
+from hilctl.base.table import Column
 from hilctl.experiment.correction import write_correction
 from hilctl.experiment.load import inputs_of
 from hilctl.ilc.ilc_session import IlcSession
@@ -15,6 +17,15 @@ from hilctl.ilc.results import IlcResult, IlcRow
 from hilctl.recording.run_summary import recordings_in
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.start import paced, unpaced
+from hilctl.studies.calibrate import (
+    CalibrationFit,
+    Origin,
+    existing_calibration,
+    fit_sensor,
+    measure_amplifier,
+    sensor_points,
+    write_calibration,
+)
 from hilctl.studies.campaign.campaign_runner import (
     CampaignHost,
     CampaignResult,
@@ -38,6 +49,78 @@ from hilctl.studies.characterise.rig_page import write_characterisation
 
 def _nothing(*_ignored: object) -> None:
     pass
+
+
+def calibrate_sensor(
+    table: PathLike,
+    output: PathLike,
+    *,
+    by: str,
+    reference: str,
+    reading_column: Column = 1,
+    true_column: Column = 2,
+    overwrite: bool = False,
+) -> CalibrationFit:
+    """Fit the curve of a sensor to pairs of reading and true displacement, and write it.
+
+    Args:
+        table: Table of any kind that ``identify`` reads; lengths without a unit are in um.
+        output: Calibration file to write; its calibration of an amplifier is kept.
+        by: Operator.
+        reference: Reference instrument.
+        reading_column: Column of the readings without calibration: name, or number from 1.
+        true_column: Column of the true displacements.
+        overwrite: Replace the calibration of a sensor in the file.
+
+    Raises:
+        InputError: The table is invalid, or the file cannot be written.
+    """
+    file, origin = Path(output), Origin(datetime.now(UTC).date(), by, reference)
+    before = existing_calibration(file, "sensor", [Path(table)], overwrite=overwrite)
+    points = sensor_points(Path(table), (reading_column, true_column))
+    found = fit_sensor(str(table), *points, origin)
+    write_calibration(file, found.fitted, before)
+    return found
+
+
+def calibrate_amplifier(
+    experiment: PathLike,
+    output: PathLike,
+    *,
+    by: str,
+    reference: str = "device.measure",
+    settings: Settings = (),
+    fast: bool = False,
+    overwrite: bool = False,
+) -> CalibrationFit:
+    """Step the command within a tenth of its limits, read it back, fit gain and offset.
+
+    Args:
+        experiment: Experiment file with device and limits.
+        output: Calibration file to write; its calibration of a sensor is kept. The recording has
+            the same name.
+        by: Operator.
+        reference: Instrument that reads the command back.
+        settings: Overrides of the experiment.
+        fast: Simulate without waiting; simulated devices only.
+        overwrite: Replace the calibration of an amplifier in the file, and the recording.
+
+    Raises:
+        InputError: An input is invalid, or a file cannot be written; nothing has moved.
+        RunError: The run ended early.
+    """
+    path, texts, file = Path(experiment), texts_of(settings), Path(output)
+    origin = Origin(datetime.now(UTC).date(), by, reference)
+    recording = file.with_suffix(".mcap")
+    inputs = inputs_of(path, texts)
+    before = existing_calibration(file, "amplifier", inputs[:1], overwrite=overwrite)
+    check_writable(recording, overwrite=overwrite, inputs=inputs)
+    finish_dead_runs()
+    found = measure_amplifier(
+        path, texts, recording, origin, unpaced if fast else paced, overwrite=overwrite
+    )
+    write_calibration(file, found.fitted, before)
+    return found
 
 
 def characterise(

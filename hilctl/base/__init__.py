@@ -10,6 +10,7 @@ samples.py     columns and flags of samples, blocks of samples
 events.py      events of a run
 segments.py    segments of a run and their steady cycles
 formatting.py  numbers with units, printable texts, JSON
+calibration.py  calibration files of sensor and amplifier
 table.py       columns of numbers by name
 table_file.py  tables of any kind of file
 yaml/          strict YAML with the line of every value

@@ -9,6 +9,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field
 from typing import Any, ClassVar, Protocol, runtime_checkable
 
+from hilctl.base.calibration import NamedCalibration
 from hilctl.base.errors import InputError
 from hilctl.base.strict import Field, StrictModel
 from hilctl.base.types import F64, CommandUnit
@@ -89,6 +90,8 @@ class DeviceInfo:
         details: Facts for the recording (serial numbers, physical parameters). Opening may add some
             (``transactions``: requests per tick).
         files: YAML texts for the recording by file name, such as ``profile.yaml``.
+        calibration: Calibration of sensor and amplifier. With one of the sensor, the device has the
+            last exchange's readings before their correction as ``reading_um``.
     """
 
     name: str
@@ -116,6 +119,12 @@ class DeviceInfo:
     confirms: bool = True
     details: Mapping[str, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
+    calibration: NamedCalibration | None = None
+
+    @property
+    def corrects_readings(self) -> bool:
+        """Whether displacements are readings corrected by the calibration of the sensor."""
+        return self.calibration is not None and self.calibration.content.sensor is not None
 
 
 REQUIRED = ("info", "open", "exchange", "make_safe", "close")

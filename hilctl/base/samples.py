@@ -17,9 +17,10 @@ LAST_SAMPLE = 2**40
 LONGEST_NS = 2**60
 """Above every time of a tick since the start of the machine."""
 
-WhenRecorded: TypeAlias = Literal["always", "measured", "own_input", "aged"]
+WhenRecorded: TypeAlias = Literal["always", "measured", "own_input", "aged", "corrected"]
 """``measured``: if the device measures its command; ``own_input``: if the compensator's input
-differs from the reference; ``aged``: if the sensor sends unasked."""
+differs from the reference; ``aged``: if the sensor sends unasked; ``corrected``: if readings are
+corrected by a calibration."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -142,6 +143,15 @@ class Samples:
             "time since the displacement arrived from a sensor that sends unasked; NaN before that",
             RecordedField("reading_age_s", "s", block=17, before=18),
             when="aged",
+            answered=True,
+        ),
+    ] = field(default_factory=_empty)
+    reading_um: Annotated[
+        F64,
+        SampleColumn(
+            "displacement as the sensor read it, before the correction by its calibration",
+            RecordedField("reading_um", "um", block=18, before=19),
+            when="corrected",
             answered=True,
         ),
     ] = field(default_factory=_empty)

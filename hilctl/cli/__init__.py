@@ -12,6 +12,7 @@ recordings.py     list, export, recover
 reports.py        report, figures, replay
 models.py         identify, refine, compare
 campaigns.py      campaign, sweep, learn
+calibrate.py      calibrate
 characterise.py   characterise
 devices.py        doctor, devices
 
@@ -38,7 +39,7 @@ from hilctl.run.run_folder import WORKS_ANYWHERE
 
 ACTING = (
     *("run", "set", "mark", "stop", "safe"),
-    *("characterise", "campaign", "sweep", "learn", "demo"),
+    *("calibrate", "characterise", "campaign", "sweep", "learn", "demo"),
 )
 """Commands that move an actuator or change a run."""
 

@@ -64,6 +64,9 @@ _MODULES = {
         "compare": "Identify models of the literature on the same loops and compare them.",
         "export-model": "Write the inverse of a model as one C or MATLAB function.",
     },
+    "hilctl.cli.calibrate": {
+        "calibrate": "Calibrate the sensor from a table, or the amplifier by small steps."
+    },
     "hilctl.cli.characterise": {
         "characterise": "Measure a connected actuator within its limits, "
         "then identify and validate a model."

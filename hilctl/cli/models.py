@@ -175,9 +175,9 @@ def identify(
         check_writable(html, overwrite=overwrite, inputs=[*files, *(validate or [])])
     table = {
         "table.unit": unit,
-        "table.command_column": _column(command_column),
-        "table.displacement_column": _column(displacement_column),
-        "table.time_column": _column(time_column),
+        "table.command_column": column_of(command_column),
+        "table.displacement_column": column_of(displacement_column),
+        "table.time_column": column_of(time_column),
         "table.rate_hz": rate_hz,
         "table.command_scale": command_scale,
         "table.displacement_scale": displacement_scale,
@@ -210,7 +210,8 @@ def identify(
         raise typer.Exit(1)
 
 
-def _column(text: str | None) -> str | int | None:
+def column_of(text: str | None) -> str | int | None:
+    """Return the column that an option names, by name or number."""
     return int(text) if text is not None and text.isdecimal() else text
 
 

@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Iterator
+from datetime import UTC, datetime
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigProblem, DeviceError
@@ -12,6 +13,7 @@ from hilctl.loop.interlocks import InterlockContext, InterlockRequirement, Inter
 SHORTEST_TICK_S = 1e-4
 """Shortest tick that timers keep on most machines: an idle CPU takes up to 0.1 ms to wake."""
 _TRAVEL = 0.02  # of the command's range: far above noise, far below any useful run
+_YEAR_DAYS = 366
 _TIMEOUT_TICKS = 3  # that devices ask for when they are opened
 
 
@@ -23,6 +25,19 @@ def pace_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
     return (
         f"sample_rate_hz: {1.0 / config.tick_s:g} ticks per second: on most machines timers wake "
         f"the loop too late for some of them. {remedy}",
+    )
+
+
+def calibration_warnings(info: DeviceInfo, now_s: float) -> tuple[str, ...]:
+    """Return a warning for each calibration that is too old at a Unix time."""
+    if info.calibration is None:
+        return ()
+    today = datetime.fromtimestamp(now_s, UTC).date()
+    return tuple(
+        f"device.calibration: the {part} was calibrated on {made}, more than a year ago. Calibrate "
+        f"it again with 'hilctl calibrate {part}'."
+        for part, made in info.calibration.content.dates.items()
+        if (today - made).days > _YEAR_DAYS
     )
 
 

@@ -20,7 +20,8 @@ from hilctl.models.model_file import load_model
 
 T = TypeVar("T")
 FILE_KEYS = {"compensator.model", "compensator.correction", "compensator.initial_state",
-             "waveform.path", "device.profile", "device.reader.profile"}  # fmt: skip
+             "waveform.path", "device.profile", "device.reader.profile",
+             "device.calibration"}  # fmt: skip
 """Keys of an experiment that name files, relative to its own folder."""
 
 

@@ -26,7 +26,7 @@ from hilctl.experiment.closed_loop import (
 )
 from hilctl.experiment.coil_heat import CoolingCoil
 from hilctl.experiment.conditioning import condition_problems, conditioning_of, measures_offset
-from hilctl.experiment.device_rules import device_problems, pace_warnings
+from hilctl.experiment.device_rules import calibration_warnings, device_problems, pace_warnings
 from hilctl.experiment.device_state import (
     CompensatorStart,
     InitialState,
@@ -142,7 +142,9 @@ def check(
         worst = forecast_of(loaded, reference, begun, conditioned, input_um=input_um)
         if found := command_problems(loaded, worst, reference):
             raise ConfigError([at_worst(each) for each in found])
-    warnings += (*pace_warnings(config, loaded.device.info), *_clamped(loaded, forecast))
+    info = loaded.device.info
+    warnings += (*pace_warnings(config, info), *calibration_warnings(info, now_s))
+    warnings += tuple(_clamped(loaded, forecast))
     return CheckedExperiment(
         loaded, reference, forecast, begun, warnings, heat_a2, operator, findings.expected
     )

@@ -28,6 +28,7 @@ class Block:
         measured: Measured command, filled by the device if it has one: float64[B].
         input_um: The compensator's input: float64[B]; in the waveform's unit without a model.
         reading_age_s: Age of the displacement, if the sensor sends unasked: float64[B].
+        reading_um: Displacement before its correction, if there is a calibration: float64[B].
     """
 
     def __init__(self, head: "memoryview[int]", area: BlockBatch, slot: int) -> None:
@@ -46,4 +47,5 @@ class Block:
             self.measured,
             self.input_um,
             self.reading_age_s,
+            self.reading_um,
         ) = self.columns

@@ -72,6 +72,14 @@ class Loop:
         self._plan = plan
         self._device = device
         self._aging = cast(AgingDevice, device) if device.info.ages_readings else None
+        self._attributes = [
+            name
+            for name, has in (
+                ("reading_age_s", device.info.ages_readings),
+                ("reading_um", device.info.corrects_readings),
+            )
+            if has
+        ]
         self._host = host
         self._clock = host.clock
         self._compensator = plan.compensator
@@ -331,8 +339,8 @@ class Loop:
             head[_FIRST_SAMPLE], sent.command, answered.displacement_um, answered.measured
         )
         head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
-        if self._aging is not None:
-            answered.reading_age_s[:] = self._aging.reading_age_s
+        for name in self._attributes:  # columns that the device does not fill itself
+            getattr(answered, name)[:] = getattr(self._device, name)
         if not early:
             in_flight.popleft()
             self._process_answer(answered, self._interlocks.judge(answered))

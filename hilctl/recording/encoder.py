@@ -48,6 +48,7 @@ class RecordingLayout:
         records_input: Whether the compensator's input differs from the reference.
         ages_readings: Whether the sensor sends unasked, so that its readings have an age.
         waveform_unit: ``um``, or the command unit without a compensator.
+        corrects_readings: Whether displacements are corrected by a calibration.
     """
 
     sample_rate_hz: float
@@ -58,6 +59,7 @@ class RecordingLayout:
     records_input: bool = False
     waveform_unit: str = "um"
     ages_readings: bool = False
+    corrects_readings: bool = False
 
     def __post_init__(self) -> None:
         """Check rates and clock; times in ns exceed 64 bits after 2260."""
@@ -77,6 +79,7 @@ class RecordingLayout:
             "measured": self.measures_command,
             "own_input": self.records_input,
             "aged": self.ages_readings,
+            "corrected": self.corrects_readings,
         }
         return given.get(column.when, True)
 
@@ -123,6 +126,7 @@ class RecordingLayout:
                 records_input=facts.get("records_input") == "true",
                 waveform_unit=facts.get("waveform_unit", "um"),
                 ages_readings=facts.get("ages_readings") == "true",
+                corrects_readings=facts.get("corrects_readings") == "true",
             )
         except (KeyError, ValueError, InputError) as error:
             raise DataError(f"metadata hilctl.run: missing or damaged: {error}") from None

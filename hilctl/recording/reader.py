@@ -228,7 +228,7 @@ def _samples(index: I64, flags: U32, unit: CommandUnit, values_of: Callable[[str
         values = values_of(field)
         if not values.size and column.otherwise:
             values = columns[column.otherwise]
-        sizes = {index.size} | ({0} if column.when in {"measured", "aged"} else set())
+        sizes = {index.size} | ({0} if column.when in {"measured", "aged", "corrected"} else set())
         if values.size not in sizes:
             counted = f"{values.size} values of {field} for {index.size} samples"
             raise DataError(f"/samples: {counted}, commands in {unit}")

@@ -241,6 +241,7 @@ class Recorder:
                 records_input=self._checked.records_input,
                 waveform_unit=self._checked.reference.unit,
                 ages_readings=info.ages_readings,
+                corrects_readings=info.corrects_readings,
             ),
         )
 

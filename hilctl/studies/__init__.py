@@ -1,13 +1,14 @@
 """Experiments of several runs.
 
 step_runner.py  what campaign and characterisation share: host, disk space, cooling, progress
+calibrate.py    calibration of sensor and amplifier
 campaign/       runs of one experiment over a grid of parameters
 characterise/   measure a connected actuator, then identify and validate a model
 multi_run/      reports of many runs
 """
 
 PUBLIC = (
-    "campaign.campaign_runner", "campaign.parallel_simulation", "campaign.plan",
+    "calibrate", "campaign.campaign_runner", "campaign.parallel_simulation", "campaign.plan",
     "campaign.steps", "campaign.store", "campaign.table",
     "characterise.characterisation_runner", "characterise.results", "characterise.rig_page",
     "multi_run.collect", "multi_run.multi_run_page", "multi_run.plots", "multi_run.trend",

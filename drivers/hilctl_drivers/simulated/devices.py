@@ -12,7 +12,7 @@ from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 import numpy as np
 
 from hilctl.base.device import DeviceInfo, DeviceOptions, VoltageLimit
-from hilctl.base.errors import DeviceError
+from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.strict import (
     Field,
     StrictModel,
@@ -21,7 +21,7 @@ from hilctl.base.strict import (
     model_validator,
 )
 from hilctl.base.types import F64
-from hilctl_drivers.device import DacDevice, details_of
+from hilctl_drivers.device import CalibrationName, DacDevice, details_of
 from hilctl_drivers.simulated.actuator_base import Plant, RodParameters
 from hilctl_drivers.simulated.diffusion import DiffusionParameters
 from hilctl_drivers.simulated.domains import DomainsParameters
@@ -40,6 +40,7 @@ from hilctl_drivers.simulated.thermal_switching import SwitchingParameters
 FIFO_DEPTH = 4096
 MAX_RATE_HZ = 200e3
 _SETTLING_S = 0.1
+_S_SHAPE = 1.5 * 3.0**0.5  # 1 / largest value of x - x^3
 _LOST = {
     "no_answer": "no answer in time (injected fault)",
     "refused": "the block was refused (injected fault)",
@@ -65,6 +66,15 @@ class SimulatedOptions(DeviceOptions):
 
     seed: int = Field(default=1, ge=0, description="seed of the sensor noise")
     noise: bool = Field(default=True, description="whether the sensor has noise")
+    nonlinearity_percent: float = Field(
+        default=0.0,
+        ge=-5.0,
+        le=5.0,
+        description="largest error of the sensor, S-shaped, in percent of its range",
+    )
+    calibration: CalibrationName | None = Field(
+        default=None, description="calibration file of the sensor to apply"
+    )
     fault: SimulatedFault | None = Field(default=None, description="fault to inject")
     output_at_open: float | None = Field(
         default=0.0,
@@ -85,6 +95,9 @@ class SimulatedDevice(DacDevice):
         **info: Any,
     ) -> None:
         """Describe the device; a recording keeps parameters and options as its details."""
+        calibration = options.calibration
+        if calibration is not None and calibration.content.amplifier is not None:
+            raise InputError("calibration: a simulated device has no amplifier: remove amplifier")
         plain = asdict(parameters)
         details = plain | plain.pop("rods", {}) | options.model_dump(mode="json")
         described = DeviceInfo(
@@ -96,10 +109,13 @@ class SimulatedDevice(DacDevice):
             measures_command=True,
             simulated=True,
             details=details_of(details),
+            calibration=calibration,
             **info,
         )
         super().__init__(described, described.name, "exchange a block", "the output")
         self._fault = options.fault
+        self._reach_um = parameters.sensor_range_um
+        self._bend = _S_SHAPE * 2.0 * self._reach_um * 0.01 * options.nonlinearity_percent
         self._output_at_open = options.output_at_open
         self._plant: Plant | None = None
         self._next_sample = 0
@@ -136,6 +152,9 @@ class SimulatedDevice(DacDevice):
         if first_sample > self._next_sample:
             self._plant.hold(first_sample - self._next_sample, self._last_command)
         self._plant.step(command, displacement_um, measured)
+        if self._bend:
+            share = displacement_um / self._reach_um
+            displacement_um += self._bend * (share - share**3)
         if fault is not None:
             self._spoil(fault, first_sample, displacement_um)
             self._last_reading_um = displacement_um.item(-1)
@@ -176,8 +195,8 @@ class SimulatedDevice(DacDevice):
         elif fault.kind == "sensor_inverted":
             np.negative(spoilt, out=spoilt)
         elif fault.kind == "sensor_jump":
-            spoilt += 0.5 * self._info.sensor_max_um
-            np.minimum(spoilt, self._info.sensor_max_um, out=spoilt)
+            spoilt += 0.5 * self._reach_um
+            np.minimum(spoilt, self._reach_um, out=spoilt)
 
 
 Physics: TypeAlias = Literal[

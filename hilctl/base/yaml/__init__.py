@@ -5,9 +5,9 @@ errors.py  validation errors in words, and tolerant readings of unambiguous valu
 """
 
 from hilctl.base.yaml.errors import Loc, broken_rules, dotted, loc_of
-from hilctl.base.yaml.io import Document, commented, dump, load_document
+from hilctl.base.yaml.io import Document, commented, dump, load_document, option_file
 
 __all__ = [
     "Document", "Loc", "broken_rules", "commented", "dotted", "dump",
-    "load_document", "loc_of",
+    "load_document", "loc_of", "option_file",
 ]  # fmt: skip

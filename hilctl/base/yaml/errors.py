@@ -94,20 +94,17 @@ def broken_rules(
     location of the model's data in the file.
     """
     problems: list[ConfigProblem] = []
-    broken: list[_Broken] = []
-    for detail in error.errors(include_url=False):
-        cause = detail.get("ctx", {}).get("error")
-        if isinstance(cause, ConfigError):  # from another file, with its own place
-            problems += cause.problems
-        else:
-            broken.append(_located(model, detail))
+    broken = [_located(model, detail) for detail in error.errors(include_url=False)]
     # Ignore type errors of union members if another member matched the type.
     meant = {
         each.loc[:n] for each in broken if not each.of_choice for n in range(len(each.loc) + 1)
     }
     groups: dict[Loc, list[_Broken]] = {}
     for index, each in enumerate(broken):
-        if not (each.of_choice and each.loc in meant):
+        cause = each.detail.get("ctx", {}).get("error")
+        if isinstance(cause, ConfigError):  # from another file, with its own place
+            problems += cause.problems
+        elif not (each.of_choice and each.loc in meant):
             groups.setdefault(each.loc if each.of_choice else (index, *each.loc), []).append(each)
     return problems + [_problem(group, where, at) for group in groups.values()]
 

@@ -21,10 +21,11 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 import yaml
-from pydantic import BaseModel, ValidationError
+from pydantic import BaseModel, ValidationError, ValidationInfo
+from pydantic_core import PydanticKnownError
 from yaml.composer import ComposerError
 
-from hilctl.base.errors import ConfigError, ConfigProblem
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml.errors import NUMBERS, Loc, broken_rules, dotted, odd_characters, readings
 
@@ -36,6 +37,7 @@ MAX_VALUES = 50_000
 """Largest number of values, lists and mappings; the parser takes up to 0.1 ms for each."""
 
 Model = TypeVar("Model", bound=BaseModel)
+Named = TypeVar("Named")
 _log = logging.getLogger(__name__)
 _UNREADABLE = "is not readable YAML"
 _TAG = "tag:yaml.org,2002:"
@@ -330,6 +332,35 @@ def load_document(path: Path, files: TextFiles | None = None) -> Document:
         ConfigError: See :class:`Document`.
     """
     return Document(str(path), (files or TextFiles()).read(path))
+
+
+class OptionFileError(ConfigError, ValueError):
+    """A file that options name breaks rules; a ``ValueError``: validation collects it."""
+
+
+def option_file(
+    kind: type[Named], load: Callable[[str, TextFiles | None, Path | None], Named]
+) -> Callable[[object, ValidationInfo], Named]:
+    """Return the validator of an option that names a file, read by ``load``.
+
+    The validation's context may have ``files``, which reads texts, and ``folder``, the base of
+    relative paths. So a run uses the checked text, also in another process.
+    """
+
+    def named(value: object, info: ValidationInfo) -> Named:
+        if isinstance(value, kind):
+            return value
+        if not isinstance(value, str):
+            raise PydanticKnownError("string_type")
+        context = info.context or {}
+        try:
+            return load(value, context.get("files"), context.get("folder"))
+        except ConfigError as error:
+            raise OptionFileError(error.problems) from None
+        except InputError as error:
+            raise ValueError(str(error)) from None
+
+    return named
 
 
 def _at(data: Any, loc: Loc) -> Any:

@@ -41,11 +41,8 @@ def test_rows_of_a_block_are_the_columns_in_order() -> None:
     for row, name in enumerate(COLUMNS):
         assert getattr(samples, name).tolist() == made.columns[1:, row].ravel().tolist()
     assert samples.flags.tolist() == made.flags[1:].ravel().tolist()
-    assert [list(COLUMNS)[row] for row in ANSWERS] == [
-        "displacement_um",
-        "measured",
-        "reading_age_s",
-    ]
+    answers = ["displacement_um", "measured", "reading_age_s", "reading_um"]
+    assert [list(COLUMNS)[row] for row in ANSWERS] == answers
 
 
 def test_rows_are_chosen_of_every_column() -> None:

@@ -6,7 +6,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.cli.models import _column, _numbers, headings, notes, render_comparison, table_rows
+from hilctl.cli.models import _numbers, column_of, headings, notes, render_comparison, table_rows
 from hilctl.comparison.compare import ComparisonRequest, compare
 from hilctl.experiment.examples import examples_folder
 from hilctl.identify.settings import IdentifySettings
@@ -89,7 +89,7 @@ def test_frequencies_are_numbers():
 
 @pytest.mark.parametrize(("text", "column"), [("3", 3), ("drive", "drive"), (None, None)])
 def test_column_is_a_number_or_a_name(text, column):
-    assert _column(text) == column
+    assert column_of(text) == column
 
 
 def test_a_model_is_exported(hilctl, json_of, tmp_path):

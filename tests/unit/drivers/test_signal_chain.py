@@ -3,6 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
+from hilctl.base.calibration import AmplifierCalibration
 from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_profile import AsciiWatchdog
 from hilctl_drivers.profile import load_profile
@@ -126,3 +127,22 @@ def test_input_of_its_own_output_is_no_sensor():
     supply = load_profile("kepco_bop")
     with pytest.raises(InputError, match="as reader"):
         channel("input", "current", supply.inputs, supply.title)
+
+
+def test_a_calibrated_amplifier_puts_out_the_command():
+    origin = {"date": "2026-01-31", "by": "N. N.", "reference": "shunt"}
+    left = {"residual_rms": 0.0, "residual_max": 0.0}
+    line = {"unit": "A", "range": (-1.0, 1.0), "gain": 1.02, "offset": 0.1}
+    calibrated = AmplifierCalibration.model_validate(origin | left | line)
+    given = Amplifier(gain_a_per_v=2.0, offset_a=-1.0), Sensor(um_per_v=1.0)
+    nominal, chain = (
+        SignalChain(VOLTS, VOLTS, *given),
+        SignalChain(VOLTS, VOLTS, *given, calibrated),
+    )
+    for command in (-3.0, 0.0, 2.5):
+        actual = 1.02 * nominal.command(chain.output(command)) + 0.1
+        assert actual == pytest.approx(command)
+        assert chain.command(chain.output(command)) == pytest.approx(command)
+    assert chain.command_range == pytest.approx([1.02 * each + 0.1 for each in (-21.0, 19.0)])
+    with pytest.raises(InputError, match=r"amplifier\.unit"):
+        SignalChain(VOLTS, VOLTS, *given, calibrated.model_copy(update={"unit": "V"}))

@@ -2,6 +2,7 @@
 
 import math
 from dataclasses import replace
+from datetime import datetime
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,12 @@ import pytest
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
 from hilctl.experiment import device_rules
-from hilctl.experiment.device_rules import interlock_context, pace_warnings
+from hilctl.experiment.device_rules import calibration_warnings, interlock_context, pace_warnings
 from hilctl.experiment.load import load_experiment, resolve
 from hilctl.experiment.preflight import check
 from hilctl.loop.interlocks import Interlocks, InterlockSettings
 from tests.published import terfenol_rdpi
+from tests.unit.base.test_calibration import CALIBRATION
 
 CURRENT = """\
 name: current
@@ -238,6 +240,15 @@ def warned(*settings, **info):
 def test_ticks_of_less_than_a_tenth_of_a_millisecond_are_told(block, told):
     """The demo has 50 kHz."""
     assert bool(warned(f"block={block}")) == told
+
+
+@pytest.mark.parametrize(("now", "warnings"), [("2027-01-31", 0), ("2027-02-02", 1)])
+def test_a_calibration_of_more_than_a_year_ago_is_told(tmp_path, now, warnings):
+    path = tmp_path / "calibration.yaml"
+    path.write_text(CALIBRATION)
+    info = loaded(CURRENT, f"device.calibration={path}").device.info
+    now_s = datetime.fromisoformat(f"{now}T12:00+00:00").timestamp()
+    assert len(calibration_warnings(info, now_s)) == warnings
 
 
 @pytest.mark.parametrize(("block", "problems"), [(58, 1), (580, 0)])

@@ -561,8 +561,11 @@ def test_the_last_block_may_be_no_whole_one():
 class AgingFakeDevice(FakeDevice):
     """A device with a sensor that sends unasked: each reading is as old as its sample's number."""
 
-    info: FakeInfo = field(default_factory=lambda: FakeInfo(ages_readings=True))
+    info: FakeInfo = field(
+        default_factory=lambda: FakeInfo(ages_readings=True, corrects_readings=True)
+    )
     lost_readings: int = 3
+    reading_um: float = 7.0
 
     @property
     def reading_age_s(self):
@@ -576,5 +579,7 @@ def test_the_age_of_each_reading_is_recorded_and_lost_ones_are_counted(break_at)
     age_s = rig.host.column([*COLUMNS].index("reading_age_s"))
     ages = [*range(len(rig.device.commands))] + [np.nan] * (break_at == 30)
     assert np.array_equal(age_s, ages, equal_nan=True)
+    reading_um = rig.host.column([*COLUMNS].index("reading_um"))
+    assert np.array_equal(np.isnan(reading_um), np.isnan(ages))
     lost = [dict(each.values) for each in rig.host.events if each.code == LOST_READINGS]
     assert lost == [{"readings": 3}]

@@ -59,6 +59,7 @@ def write(
             records_input=own_input,
             waveform_unit=waveform_unit,
             ages_readings=measures,
+            corrects_readings=measures,
         ),
     )
     writer = RecordingWriter(stream, facts)

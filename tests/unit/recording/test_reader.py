@@ -61,6 +61,7 @@ def test_what_is_written_is_read(make, unit, measures, own_input, values):
         written,
         measured=written.measured if measures else np.empty(0),
         reading_age_s=written.reading_age_s if measures else np.empty(0),
+        reading_um=written.reading_um if measures else np.empty(0),
         input_um=written.input_um if own_input else written.reference_um,
     )
     same_samples(back.samples, expected)

@@ -15,18 +15,18 @@ def test_field_numbers_stay():
     assert {name: " ".join(each.values()) for name, each in numbers.items()} == {
         "SampleBlock": "tick0 n dropped t_rel reference_um wanted_a current_a displacement_um "
         "flags measured_a wanted_v drive_v measured_v state previous_command input_um "
-        "reading_age_s",
+        "reading_age_s reading_um",
         "TickBlock": "first_sample deadline_ns late_ns exchange_ns",
         "Sample": "sample t_rel reference_um wanted_a current_a displacement_um flags wanted_v "
         "drive_v",
         "Event": "sample level code text before_sample before_reference_um before_wanted_a "
         "before_current_a before_displacement_um before_flags before_wanted_v before_drive_v "
         "value_names values before_measured_a before_measured_v before_input_um "
-        "before_reading_age_s",
+        "before_reading_age_s before_reading_um",
     }
-    assert list(numbers["SampleBlock"]) == list(range(1, 18))
+    assert list(numbers["SampleBlock"]) == list(range(1, 19))
     assert list(numbers["Sample"]) == list(range(1, 10))
-    assert list(numbers["Event"]) == list(range(1, 19))
+    assert list(numbers["Event"]) == list(range(1, 20))
 
 
 def test_independent_reader_agrees(recorded, make):

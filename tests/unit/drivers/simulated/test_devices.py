@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hilctl.base.errors import DeviceError
+from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.simulated.devices import (
     PiezoOptions,
     SimulatedFault,
@@ -12,6 +12,7 @@ from hilctl_drivers.simulated.devices import (
     SimulatedTerfenol,
     TerfenolOptions,
 )
+from tests.unit.base.test_calibration import AMPLIFIER, CALIBRATION
 
 RATE_HZ = 50e3
 BLOCK = 50
@@ -197,3 +198,43 @@ class TestFaults:
                 send(device, first_sample, np.zeros(BLOCK))
         device.make_safe(1.0)
         assert device._last_command == 1.0
+
+
+@pytest.fixture
+def calibration(tmp_path):
+    """A file with readings of -50 to 50 um, whose true displacement is 1 um more."""
+    path = tmp_path / "calibration.yaml"
+    path.write_text(CALIBRATION)
+    return path
+
+
+def test_a_calibration_corrects_readings(calibration):
+    plain, device = terfenol(), terfenol(calibration=str(calibration))
+    displacement_um = send_all(device, wave(1000))
+    np.testing.assert_allclose(displacement_um, send_all(plain, wave(1000)) + 1.0)
+    np.testing.assert_allclose(device.reading_um, displacement_um[-BLOCK:] - 1.0)
+    assert device.info.files["calibration.yaml"] == CALIBRATION
+
+
+def test_a_reading_out_of_the_calibrated_range_is_its_end(calibration):
+    """The interlock treats the ends of the sensor's range as invalid."""
+    fault = {"kind": "sensor_jump", "at_sample": 0}
+    device = terfenol(calibration=str(calibration), fault=fault)
+    info = device.info
+    assert (info.sensor_min_um, info.sensor_max_um) == (-49.0, 51.0)
+    assert (send_all(device, wave(BLOCK)) == 51.0).all()
+    assert (device.reading_um > 51.0).all()
+
+
+def test_a_simulated_device_has_no_amplifier_to_calibrate(calibration):
+    calibration.write_text(CALIBRATION + AMPLIFIER)
+    with pytest.raises(InputError, match="remove amplifier"):
+        terfenol(calibration=str(calibration))
+
+
+def test_a_bent_sensor_has_its_largest_error_in_percent_of_the_range():
+    bent, plain = terfenol(noise=False, nonlinearity_percent=1.5), terfenol(noise=False)
+    command = np.linspace(0.0, 8.0, 5000)
+    error = send_all(bent, command) - (straight := send_all(plain, command))
+    share = straight / plain.info.sensor_max_um
+    np.testing.assert_allclose(error, 3.75 * 1.5 * 3**0.5 * (share - share**3), atol=1e-9)

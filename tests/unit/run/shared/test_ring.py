@@ -7,7 +7,7 @@ import pytest
 from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
-from hilctl.base.samples import COLUMNS, LAST_SAMPLE, LONGEST_NS, BlockHeader, Flag
+from hilctl.base.samples import ANSWERS, COLUMNS, LAST_SAMPLE, LONGEST_NS, BlockHeader, Flag
 from hilctl.run.shared import ring as module
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot
@@ -27,7 +27,7 @@ def born(ring, number, *, due=True):
     block.state[:] = -number
     for row in (block.reference, block.wanted, block.command, block.input_um):
         row[:] = number
-    block.displacement_um[:] = block.measured[:] = block.reading_age_s[:] = number
+    block.columns[ANSWERS] = number
     block.flags[:] = number
     ring.sending(block)
     return block

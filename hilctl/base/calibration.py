@@ -1,0 +1,138 @@
+"""Calibration files: the curve of a sensor, gain and offset of an amplifier, with their origin.
+
+A curve is a table of points, so that readings are interpolated and never extrapolated.
+"""
+
+from dataclasses import dataclass
+from datetime import date
+from typing import Annotated, Self
+
+import numpy as np
+
+from hilctl.base.errors import InputError
+from hilctl.base.strict import BeforeValidator, Field, StrictModel, model_validator
+from hilctl.base.types import F64, CommandUnit
+
+_POINTS = 1025  # of a polynomial: the error is below 1e-6 of the range
+
+
+def _date(value: object) -> date:
+    if isinstance(value, date):
+        return value
+    try:
+        return date.fromisoformat(value if isinstance(value, str) else "")
+    except ValueError:
+        raise ValueError("must be a date, such as 2026-01-31") from None
+
+
+class CalibrationOrigin(StrictModel):
+    """Origin of a calibration, and what it leaves.
+
+    Attributes:
+        by: Operator.
+        reference: Reference instrument.
+        residual_rms: Root mean square of the residuals, in the unit of the calibrated quantity.
+        residual_max: Largest absolute residual.
+    """
+
+    date: Annotated[date, BeforeValidator(_date)]
+    by: str
+    reference: str
+    residual_rms: Annotated[float, Field(ge=0.0)]
+    residual_max: Annotated[float, Field(ge=0.0)]
+
+
+class SensorCalibration(CalibrationOrigin):
+    """True displacement by the sensor's reading, both in um.
+
+    Attributes:
+        range_um: Lowest and highest calibrated reading.
+        polynomial: Coefficients of the true displacement, from the constant on.
+        table: Reading and true displacement of each point; instead of ``polynomial``.
+    """
+
+    range_um: tuple[float, float]
+    polynomial: Annotated[tuple[float, ...], Field(min_length=2, max_length=5)] | None = None
+    table: Annotated[tuple[tuple[float, float], ...], Field(min_length=2)] | None = None
+
+    @model_validator(mode="after")
+    def _rises(self) -> Self:
+        if (self.polynomial is None) == (self.table is None):
+            raise ValueError("must have one of polynomial and table")
+        low, high = self.range_um
+        first, last = (self.table[0][0], self.table[-1][0]) if self.table else (low, high)
+        if not first <= low < high <= last:
+            raise ValueError(f"range_um must rise within the table's readings: {[low, high]}")
+        for name, values in zip(("readings", "displacements"), self.points, strict=True):
+            if not (np.diff(values) > 0.0).all():
+                rule = "if they fall, reverse the sign of device.sensor"
+                raise ValueError(
+                    f"{'table' if self.table else 'polynomial'}: {name} must rise in "
+                    f"range_um ({rule})"
+                )
+        return self
+
+    @property
+    def points(self) -> tuple[F64, F64]:
+        """Reading and true displacement at points of the curve, float64[n] each."""
+        if self.table is not None:
+            reading, true = np.array(self.table).T
+            return reading, true
+        reading = np.linspace(*self.range_um, _POINTS)
+        return reading, np.polynomial.Polynomial(self.polynomial or ())(reading)
+
+    def curve(self, low_um: float, high_um: float) -> tuple[F64, F64]:
+        """Return the points of the curve for a sensor that reads from ``low_um`` to ``high_um``.
+
+        Raises:
+            InputError: The sensor reads nothing in the calibrated range.
+        """
+        low, high = max(low_um, self.range_um[0]), min(high_um, self.range_um[1])
+        if not low < high:
+            span = f"{low_um:g} to {high_um:g} um"
+            raise InputError(f"calibration: range_um must overlap the sensor's range, {span}")
+        reading, true = self.points
+        inner = reading[(low < reading) & (reading < high)]
+        kept = np.concatenate(([low], inner, [high]))
+        return kept, np.interp(kept, reading, true)
+
+
+class AmplifierCalibration(CalibrationOrigin):
+    """The actual command is ``gain * command + offset``.
+
+    Attributes:
+        range: Lowest and highest command of the calibration.
+    """
+
+    unit: CommandUnit
+    range: tuple[float, float]
+    gain: Annotated[float, Field(gt=0.0)]
+    offset: float
+
+
+class CalibrationFile(StrictModel):
+    """Content of a calibration file."""
+
+    sensor: SensorCalibration | None = None
+    amplifier: AmplifierCalibration | None = None
+
+    @model_validator(mode="after")
+    def _something(self) -> Self:
+        if self.sensor is None and self.amplifier is None:
+            raise ValueError("must have a sensor or an amplifier")
+        return self
+
+    @property
+    def dates(self) -> dict[str, date]:
+        """Date of each calibration."""
+        both = {"sensor": self.sensor, "amplifier": self.amplifier}
+        return {name: each.date for name, each in both.items() if each is not None}
+
+
+@dataclass(frozen=True, slots=True)
+class NamedCalibration:
+    """A calibration file, its text, and its path in the experiment."""
+
+    name: str
+    content: CalibrationFile
+    text: str

@@ -1,0 +1,72 @@
+"""A sensor that is not linear, calibrated from a noisy table: a run as with a linear one."""
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl import api
+from hilctl.base.errors import InputError
+from hilctl_drivers.simulated.terfenol import TerfenolParameters
+
+RIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
+BENT = {"device.nonlinearity_percent": 1.5}
+
+
+@pytest.fixture(scope="module")
+def calibration(tmp_path_factory):
+    """The file fitted to 21 pairs with the noise of the sensor."""
+    folder = tmp_path_factory.mktemp("calibration")
+    rated, true = TerfenolParameters(), np.linspace(-100.0, 100.0, 21)
+    share = true / rated.sensor_range_um
+    noise = np.random.default_rng(1).normal(0.0, rated.sensor_noise_um, true.size)
+    reading = true + 3.75 * 1.5 * 3**0.5 * (share - share**3) + noise
+    np.savetxt(folder / "pairs.csv", np.c_[reading, true], delimiter=",")
+    given = {"by": "N. N.", "reference": "the simulation"}
+    api.calibrate_sensor(folder / "pairs.csv", folder / "sensor.yaml", **given)
+    return folder / "sensor.yaml"
+
+
+@pytest.fixture(scope="module")
+def runs(calibration, tmp_path_factory):
+    """Runs with a linear sensor, with a bent one, and with the bent one calibrated."""
+    calibrated = BENT | {"device.calibration": str(calibration)}
+    cases = {"linear": {}, "bent": BENT, "calibrated": calibrated}
+    folder = tmp_path_factory.mktemp("runs")
+    return {
+        name: api.run(RIG, folder / f"{name}.mcap", settings=settings, fast=True)
+        for name, settings in cases.items()
+    }
+
+
+def test_the_error_is_that_of_a_linear_sensor(runs):
+    error = {name: api.summarize(run.path).peak_error_percent for name, run in runs.items()}
+    assert error["bent"] > 1.5 * error["linear"]
+    assert error["calibrated"] < 1.1 * error["linear"]
+
+
+def test_the_recording_has_the_reading_and_the_calibration(runs, calibration):
+    recording = api.read(runs["calibrated"].path).recording
+    assert recording.device_files["calibration.yaml"] == calibration.read_text()
+    assert recording.run["device.calibration_sha256"]
+    samples, bent = recording.samples, api.read(runs["bent"].path).recording.samples
+    np.testing.assert_array_equal(samples.reading_um, bent.displacement_um)
+    assert np.abs(samples.displacement_um - samples.reading_um).max() > 1.0
+    assert bent.reading_um.size == 0
+    assert api.replay(runs["calibrated"].path).identical
+
+
+def test_a_stroke_beyond_the_calibrated_range_is_refused(calibration):
+    with pytest.raises(InputError) as caught:
+        api.check(RIG, {"device.calibration": str(calibration), "limits.stroke_um": [-120.0, 60.0]})
+    assert [each.key for each in caught.value.problems] == ["limits.stroke_um"]
+
+
+@pytest.mark.parametrize(("text", "key"), [("sensor: {}", "sensor."), ("a: 1", "a"), ("", "")])
+def test_an_invalid_calibration_is_refused_with_its_own_lines(tmp_path, text, key):
+    path = tmp_path / "calibration.yaml"
+    path.write_text(text)
+    with pytest.raises(InputError) as caught:
+        api.check(RIG, {"device.calibration": str(path)})
+    assert all(each.where.startswith(str(path)) for each in caught.value.problems)
+    assert caught.value.problems[0].key.startswith(key)

@@ -1,0 +1,152 @@
+"""Fits of sensor and amplifier."""
+
+from dataclasses import replace
+from datetime import date
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.base.calibration import CalibrationFile
+from hilctl.base.errors import DataError, InputError, RunError
+from hilctl.base.yaml import load_document
+from hilctl.recording.reader import read
+from hilctl.run.start import unpaced
+from hilctl.studies import calibrate
+from hilctl.studies.calibrate import (
+    Origin,
+    existing_calibration,
+    fit_sensor,
+    measure_amplifier,
+    sensor_points,
+    write_calibration,
+)
+
+ORIGIN = Origin(date(2026, 1, 31), "N. N.", "interferometer")
+RIG = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a.yaml"
+TRUE = np.linspace(-100.0, 100.0, 21)
+
+
+def s_shaped(true):
+    """Return readings that err by up to 1.5 % of a range of 250 um."""
+    share = true / 125.0
+    return true + 3.75 * 1.5 * 3**0.5 * (share - share**3)
+
+
+def linear(true):
+    return 1.02 * true + 3.0
+
+
+def waved(true):
+    return true + 2.0 * np.sin(0.1 * true)
+
+
+def errors(fit, reading_of):
+    """Return the rms and the largest error of corrected readings, in percent of their range."""
+    fine = np.linspace(-100.0, 100.0, 1001)
+    curve = fit.fitted.curve(-200.0, 200.0)
+    left = (np.interp(reading_of(fine), *curve) - fine) / 2.0
+    return np.sqrt(np.mean(left**2)), np.abs(left).max()
+
+
+@pytest.mark.parametrize("seed", range(5))
+@pytest.mark.parametrize(("reading_of", "orders"), [(linear, {1, 2}), (s_shaped, {3, 4})])
+def test_the_lowest_order_that_the_noise_supports_is_chosen(reading_of, orders, seed):
+    noise = np.random.default_rng(seed).normal(0.0, 0.0355, TRUE.size)
+    fit = fit_sensor("pairs", reading_of(TRUE) + noise, TRUE, ORIGIN)
+    assert len(fit.fitted.polynomial) - 1 in orders
+    assert fit.fitted.residual_rms < 0.05e-2 * 200.0
+    rms, largest = errors(fit, reading_of)
+    assert rms < 0.05
+    assert largest < 0.1
+
+
+@pytest.mark.parametrize("points", [3, 4, 21])
+def test_exact_points_of_a_line_give_a_line(points):
+    true = np.linspace(-100.0, 100.0, points)
+    fit = fit_sensor("pairs", linear(true), true, ORIGIN)
+    assert len(fit.fitted.polynomial) == 2
+    assert max(errors(fit, linear)) < 1e-6
+
+
+def test_a_table_where_no_polynomial_fits():
+    true = np.repeat(np.linspace(-100.0, 100.0, 81), 2)
+    fit = fit_sensor("pairs", waved(true), true, ORIGIN)
+    assert len(fit.fitted.table) == 81
+    assert max(errors(fit, waved)) < 0.1
+
+
+def test_a_falling_curve_is_refused():
+    with pytest.raises(DataError, match=r"device\.sensor"):
+        fit_sensor("pairs", TRUE, -TRUE, ORIGIN)
+
+
+def test_units_of_columns_are_converted(tmp_path):
+    path = tmp_path / "pairs.csv"
+    path.write_text("true [mm],x,reading_um\n0.002,0,3\n0,0,1\n0.001,0,2\n")
+    reading, true = sensor_points(path, ("reading_um", 1))
+    assert reading.tolist() == [1.0, 2.0, 3.0]
+    assert true == pytest.approx([0.0, 1.0, 2.0])
+
+
+@pytest.mark.parametrize("text", [
+    "reading_v,true_um\n1,1\n2,2\n3,3\n",
+    "reading_um,true_um\n1,1\n2,2\n2,3\n",
+    "reading_um\n1\n2\n",
+])  # fmt: skip
+def test_an_unusable_table_is_refused(tmp_path, text):
+    path = tmp_path / "pairs.csv"
+    path.write_text(text)
+    with pytest.raises(DataError, match=r"pairs\.csv"):
+        sensor_points(path, (1, 2))
+
+
+def amplifier(tmp_path):
+    slow = ("sample_rate_hz=1000", "block=10")
+    return measure_amplifier(RIG, slow, tmp_path / "run.mcap", ORIGIN, unpaced, overwrite=False)
+
+
+def spoiled(monkeypatch, gain, offset):
+    def changed(path):
+        recording = read(path)
+        measured = gain * recording.samples.measured + offset
+        return replace(recording, samples=replace(recording.samples, measured=measured))
+
+    monkeypatch.setattr(calibrate, "read", changed)
+
+
+def test_gain_and_offset_of_the_read_back(tmp_path, monkeypatch):
+    spoiled(monkeypatch, 1.03, 0.02)
+    fit = amplifier(tmp_path)
+    assert fit.fitted.gain == pytest.approx(1.03, abs=1e-3)
+    assert fit.fitted.offset == pytest.approx(0.02, abs=1e-3)
+    assert fit.fitted.range == pytest.approx((-0.707, 0.707))
+    assert np.abs(read(tmp_path / "run.mcap").samples.command).max() == pytest.approx(0.707)
+    assert fit.fitted.residual_max < 1e-3
+
+
+def test_a_read_back_without_the_command_is_refused(tmp_path, monkeypatch):
+    spoiled(monkeypatch, -1.0, 0.0)
+    with pytest.raises(RunError, match=r"device\.measure"):
+        amplifier(tmp_path)
+
+
+def test_a_device_that_does_not_measure_is_refused(tmp_path):
+    rig = RIG.with_name("modbus_labjack_t7.yaml")
+    with pytest.raises(InputError, match=r"device\.measure"):
+        measure_amplifier(rig, (), tmp_path / "run.mcap", ORIGIN, unpaced, overwrite=False)
+    assert not any(tmp_path.iterdir())
+
+
+def test_a_file_keeps_its_other_part(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    sensor = fit_sensor("pairs", linear(TRUE), TRUE, ORIGIN).fitted
+    line = amplifier(tmp_path).fitted
+    for part, fitted in (("sensor", sensor), ("amplifier", line)):
+        before = existing_calibration(path, part, [], overwrite=False)
+        write_calibration(path, fitted, before)
+    content = load_document(path).validate(CalibrationFile)
+    assert (content.sensor, content.amplifier) == (sensor, line)
+    with pytest.raises(InputError, match="exists already"):
+        existing_calibration(path, "sensor", [], overwrite=False)
+    assert existing_calibration(path, "sensor", [], overwrite=True) == content
