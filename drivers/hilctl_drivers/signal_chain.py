@@ -354,6 +354,7 @@ class SignalChain:
         self._output_unit = output.unit
         self._gain = 1.0 if amplifier is None else amplifier.gain
         self._offset = 0.0 if amplifier is None else amplifier.offset
+        self._measured = self._gain, self._offset
         if calibrated is not None:
             if calibrated.unit != self.command_unit:
                 rule = f"calibration: amplifier.unit must be {self.command_unit}"
@@ -393,7 +394,7 @@ class SignalChain:
             InputError: The input is neither in the unit of the output nor in that of the command.
         """
         if source.unit == self._output_unit:
-            return self._gain, self._offset
+            return self._measured  # a calibration is relative to what is measured
         gain = source.per_unit(self.command_unit)
         if gain is None:
             units = " or ".join(dict.fromkeys((self._output_unit, self.command_unit)))

@@ -45,6 +45,7 @@ from hilctl.studies.characterise.characterisation_runner import (
 )
 from hilctl.studies.characterise.results import Characterisation, StepRow
 from hilctl.studies.characterise.rig_page import write_characterisation
+from hilctl.studies.step_runner import StudyHost
 
 
 def _nothing(*_ignored: object) -> None:
@@ -92,6 +93,7 @@ def calibrate_amplifier(
     settings: Settings = (),
     fast: bool = False,
     overwrite: bool = False,
+    on_progress: Callable[[float, str], None] = _nothing,
 ) -> CalibrationFit:
     """Step the command within a tenth of its limits, read it back, fit gain and offset.
 
@@ -104,6 +106,7 @@ def calibrate_amplifier(
         settings: Overrides of the experiment.
         fast: Simulate without waiting; simulated devices only.
         overwrite: Replace the calibration of an amplifier in the file, and the recording.
+        on_progress: Called with the fraction done (0 to 1) and the current step.
 
     Raises:
         InputError: An input is invalid, or a file cannot be written; nothing has moved.
@@ -116,9 +119,8 @@ def calibrate_amplifier(
     before = existing_calibration(file, "amplifier", inputs[:1], overwrite=overwrite)
     check_writable(recording, overwrite=overwrite, inputs=inputs)
     finish_dead_runs()
-    found = measure_amplifier(
-        path, texts, recording, origin, unpaced if fast else paced, overwrite=overwrite
-    )
+    host = StudyHost(run=unpaced if fast else paced, on_progress=on_progress)
+    found = measure_amplifier(path, texts, recording, origin, host, overwrite=overwrite)
     write_calibration(file, found.fitted, before)
     return found
 

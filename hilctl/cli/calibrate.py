@@ -1,5 +1,6 @@
 """The command ``hilctl calibrate``."""
 
+import sys
 from pathlib import Path
 from typing import Annotated
 
@@ -7,10 +8,11 @@ import typer
 
 from hilctl import api
 from hilctl.base.calibration import AmplifierCalibration
-from hilctl.cli.console import print_rich, table
+from hilctl.cli.console import print_rich, progress_bar, table
 from hilctl.cli.models import TableColumn, column_of
 from hilctl.cli.options import AsJson, ExperimentFile, Fast, Overwrite, Settings
 from hilctl.cli.output import print_result
+from hilctl.run.start import StepStoppedError
 from hilctl.studies.calibrate import CalibrationFit
 
 calibrate_ = typer.Typer(rich_markup_mode=None)
@@ -68,15 +70,21 @@ def amplifier(
     as_json: AsJson = False,
 ) -> None:
     """Step the command within a tenth of its limits, read it back, fit gain and offset."""
-    found = api.calibrate_amplifier(
-        experiment,
-        output,
-        by=by,
-        reference=reference,
-        settings=settings or [],
-        fast=fast,
-        overwrite=overwrite,
-    )
+    try:
+        with progress_bar("calibrate", quiet=as_json) as on_progress:
+            found = api.calibrate_amplifier(
+                experiment,
+                output,
+                by=by,
+                reference=reference,
+                settings=settings or [],
+                fast=fast,
+                overwrite=overwrite,
+                on_progress=on_progress,
+            )
+    except StepStoppedError as error:
+        print(f"hilctl: {error}", file=sys.stderr)
+        raise typer.Exit(128 + error.signal) from None
     _show(found, output, as_json=as_json)
 
 

@@ -1,6 +1,6 @@
 """Calibrate the sensor of a rig from a table, and its amplifier by small steps of the command."""
 
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -22,16 +22,15 @@ from hilctl.base.types import F64
 from hilctl.base.yaml import dump, load_document
 from hilctl.experiment.load import load_experiment
 from hilctl.recording.reader import read
-from hilctl.run.result import RunResult
 from hilctl.studies.characterise.characterisation_runner import unit_of, without_reference
-from hilctl.studies.step_runner import raise_if_stopped, setting
+from hilctl.studies.step_runner import StudyHost, raise_if_stopped, setting
 
 _HIGHEST_ORDER = 4
 _BETTER = 1.1  # an order must lower the error of left-out points by this factor
 _MUCH_BETTER = 2.0  # and a table that of the best polynomial
 _PART = 0.1  # of the way from the safe value to the limits
 _STEPS = 11  # levels from one end to the other
-_DWELL_S, _DWELL_SAMPLES = 0.4, 40
+_DWELL_S, _DWELL_SAMPLES = 0.4, 20
 
 
 class Origin(NamedTuple):
@@ -157,7 +156,7 @@ def measure_amplifier(
     settings: Sequence[str],
     recording: Path,
     origin: Origin,
-    run: Callable[..., RunResult],
+    host: StudyHost,
     *,
     overwrite: bool,
 ) -> CalibrationFit:
@@ -184,8 +183,12 @@ def measure_amplifier(
     dwell = int(max(2.0 * rise, _DWELL_S * rate_hz, _DWELL_SAMPLES))
     steps = {"kind": "step", "unit": unit, "levels": levels.tolist(), "rest": safe}
     times = {"dwell_s": dwell / rate_hz, "rise_s": 0.5 * dwell / rate_hz}
-    result = run(
-        experiment, [*settings, setting("waveform", steps | times)], recording, overwrite=overwrite
+    result = host.run(
+        experiment,
+        [*settings, setting("waveform", steps | times)],
+        recording,
+        lambda part: host.on_progress(part, "steps"),
+        overwrite=overwrite,
     )
     raise_if_stopped("calibrate", result)
     if result.code != "completed":

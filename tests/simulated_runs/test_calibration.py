@@ -8,6 +8,7 @@ import pytest
 from hilctl import api
 from hilctl.base.errors import InputError
 from hilctl_drivers.simulated.terfenol import TerfenolParameters
+from tests.unit.base.test_calibration import CALIBRATION
 
 RIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 BENT = {"device.nonlinearity_percent": 1.5}
@@ -60,6 +61,19 @@ def test_a_stroke_beyond_the_calibrated_range_is_refused(calibration):
     with pytest.raises(InputError) as caught:
         api.check(RIG, {"device.calibration": str(calibration), "limits.stroke_um": [-120.0, 60.0]})
     assert [each.key for each in caught.value.problems] == ["limits.stroke_um"]
+
+
+def test_a_reading_beyond_the_calibrated_range_ends_the_run(tmp_path):
+    (tmp_path / "narrow.yaml").write_text(CALIBRATION)
+    given = {
+        "device.calibration": str(tmp_path / "narrow.yaml"),
+        "device.fault": {"kind": "sensor_jump", "at_sample": 1000},
+        "limits.stroke_um": [-48.0, 51.0],
+    }
+    run = api.run(RIG, tmp_path / "run.mcap", settings=given, fast=True)
+    events = api.read(run.path).recording.events
+    assert run.code == "fault"
+    assert next(each for each in events if each.level == "error").code == "sensor_range"
 
 
 @pytest.mark.parametrize(("text", "key"), [("sensor: {}", "sensor."), ("a: 1", "a"), ("", "")])

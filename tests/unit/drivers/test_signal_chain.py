@@ -143,6 +143,7 @@ def test_a_calibrated_amplifier_puts_out_the_command():
         actual = 1.02 * nominal.command(chain.output(command)) + 0.1
         assert actual == pytest.approx(command)
         assert chain.command(chain.output(command)) == pytest.approx(command)
+    assert chain.measured(VOLTS) == nominal.measured(VOLTS) == (2.0, -1.0)
     assert chain.command_range == pytest.approx([1.02 * each + 0.1 for each in (-21.0, 19.0)])
     with pytest.raises(InputError, match=r"amplifier\.unit"):
         SignalChain(VOLTS, VOLTS, *given, calibrated.model_copy(update={"unit": "V"}))

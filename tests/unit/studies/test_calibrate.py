@@ -21,7 +21,9 @@ from hilctl.studies.calibrate import (
     sensor_points,
     write_calibration,
 )
+from hilctl.studies.step_runner import StudyHost
 
+HOST = StudyHost(run=unpaced)
 ORIGIN = Origin(date(2026, 1, 31), "N. N.", "interferometer")
 RIG = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a.yaml"
 TRUE = np.linspace(-100.0, 100.0, 21)
@@ -103,7 +105,7 @@ def test_an_unusable_table_is_refused(tmp_path, text):
 
 def amplifier(tmp_path):
     slow = ("sample_rate_hz=1000", "block=10")
-    return measure_amplifier(RIG, slow, tmp_path / "run.mcap", ORIGIN, unpaced, overwrite=False)
+    return measure_amplifier(RIG, slow, tmp_path / "run.mcap", ORIGIN, HOST, overwrite=False)
 
 
 def spoiled(monkeypatch, gain, offset):
@@ -134,7 +136,7 @@ def test_a_read_back_without_the_command_is_refused(tmp_path, monkeypatch):
 def test_a_device_that_does_not_measure_is_refused(tmp_path):
     rig = RIG.with_name("modbus_labjack_t7.yaml")
     with pytest.raises(InputError, match=r"device\.measure"):
-        measure_amplifier(rig, (), tmp_path / "run.mcap", ORIGIN, unpaced, overwrite=False)
+        measure_amplifier(rig, (), tmp_path / "run.mcap", ORIGIN, HOST, overwrite=False)
     assert not any(tmp_path.iterdir())
 
 
