@@ -46,7 +46,6 @@ class DacDevice(ABC):
 
     def __init__(self, info: DeviceInfo, title: str, action: str, output: str) -> None:
         self._curve: tuple[F64, F64] | None = None
-        self._step = self._exchange
         self.reading_um: F64 = np.empty(0)
         """Readings of the last exchange before their correction, if there is a calibration."""
         if (calibration := info.calibration) is not None:
@@ -55,7 +54,9 @@ class DacDevice(ABC):
                 curve = sensor.curve(info.sensor_min_um, info.sensor_max_um)
                 low_um, high_um = curve[1][[0, -1]].tolist()
                 info = replace(info, sensor_min_um=low_um, sensor_max_um=high_um)
-                self._curve, self._step = curve, self._corrected_exchange
+                self._curve = curve
+                # On the instance: an exchange without a calibration has no further step.
+                vars(self)["exchange"] = self._corrected_exchange
         self._info = info
         self._title = title
         self._action = action
@@ -160,7 +161,7 @@ class DacDevice(ABC):
         if not self._in_range(command):
             raise self._out_of_range(command)
         try:
-            self._step(first_sample, command, displacement_um, measured)
+            self._exchange(first_sample, command, displacement_um, measured)
         except DeviceError as error:
             raise self._failed(self._action, error, self._abandon) from None
 
@@ -172,7 +173,7 @@ class DacDevice(ABC):
         The sensor's range in :attr:`info` is the corrected one, so its ends are invalid readings.
         """
         assert self._curve is not None
-        self._exchange(first_sample, command, displacement_um, measured)
+        type(self).exchange(self, first_sample, command, displacement_um, measured)
         self.reading_um = displacement_um.copy()
         displacement_um[:] = np.interp(displacement_um, *self._curve)
 

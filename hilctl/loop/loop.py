@@ -72,14 +72,9 @@ class Loop:
         self._plan = plan
         self._device = device
         self._aging = cast(AgingDevice, device) if device.info.ages_readings else None
-        self._attributes = [
-            name
-            for name, has in (
-                ("reading_age_s", device.info.ages_readings),
-                ("reading_um", device.info.corrects_readings),
-            )
-            if has
-        ]
+        info = device.info
+        has = {"reading_age_s": info.ages_readings, "reading_um": info.corrects_readings}
+        self._attributes = [column for column, there in has.items() if there]
         self._host = host
         self._clock = host.clock
         self._compensator = plan.compensator
@@ -339,8 +334,9 @@ class Loop:
             head[_FIRST_SAMPLE], sent.command, answered.displacement_um, answered.measured
         )
         head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
-        for name in self._attributes:  # columns that the device does not fill itself
-            getattr(answered, name)[:] = getattr(self._device, name)
+        if self._attributes:
+            for column in self._attributes:
+                getattr(answered, column)[:] = getattr(self._device, column)
         if not early:
             in_flight.popleft()
             self._process_answer(answered, self._interlocks.judge(answered))
