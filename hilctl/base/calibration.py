@@ -100,14 +100,23 @@ class SensorCalibration(CalibrationOrigin):
 class AmplifierCalibration(CalibrationOrigin):
     """The actual command is ``gain * command + offset``.
 
+    A line far from the identity is a wrong read-back, which would drive the actuator too far.
+
     Attributes:
         range: Lowest and highest command of the calibration.
     """
 
     unit: CommandUnit
     range: tuple[float, float]
-    gain: Annotated[float, Field(gt=0.0)]
+    gain: Annotated[float, Field(ge=0.8, le=1.25)]
     offset: float
+
+    @model_validator(mode="after")
+    def _is_plausible(self) -> Self:
+        low, high = self.range
+        if not abs(self.offset) <= high - low:
+            raise ValueError(f"offset must be at most the width of the range, {high - low:g}")
+        return self
 
 
 class CalibrationFile(StrictModel):

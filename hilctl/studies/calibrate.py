@@ -1,6 +1,7 @@
 """Calibrate the sensor of a rig from a table, and its amplifier by small steps of the command."""
 
 from collections.abc import Sequence
+from dataclasses import dataclass
 from datetime import date
 from pathlib import Path
 from typing import Any, NamedTuple
@@ -15,6 +16,7 @@ from hilctl.base.calibration import (
 )
 from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_writable, write_text
+from hilctl.base.formatting import shown_briefly
 from hilctl.base.strict import ValidationError
 from hilctl.base.table import Column
 from hilctl.base.table_file import open_table
@@ -41,7 +43,9 @@ class Origin(NamedTuple):
     reference: str  # reference instrument
 
 
-class CalibrationFit(NamedTuple):
+@shown_briefly
+@dataclass(frozen=True, slots=True)
+class CalibrationFit:
     """A fitted calibration and its points.
 
     Attributes:
@@ -203,21 +207,24 @@ def measure_amplifier(
         np.bincount(step, values[settled], levels.size) / count
         for values in (samples.command, samples.measured)
     )
-    line = Polynomial.fit(command, measured, 1)
-    offset, gain = line.convert().coef.tolist()
-    residuals = measured - line(command)
-    if not np.isfinite(residuals).all() or not gain > 0.0:
-        text = f"the command is not read back: gain {gain:.3g}"
-        raise RunError(f"{recording}: {text}. Check device.measure and its wiring")
-    fitted = AmplifierCalibration(
-        **origin._asdict(),
-        unit=unit,
-        range=(low, high),
-        gain=gain,
-        offset=offset,
-        residual_rms=float(np.sqrt(np.sum(residuals**2) / (levels.size - 2))),
-        residual_max=float(np.abs(residuals).max()),
-    )
+    centred = command - command.mean()
+    gain = float(centred @ measured / (centred @ centred))
+    offset = float(measured.mean() - gain * command.mean())
+    residuals = measured - (gain * command + offset)
+    try:
+        fitted = AmplifierCalibration(
+            **origin._asdict(),
+            unit=unit,
+            range=(low, high),
+            gain=gain,
+            offset=offset,
+            residual_rms=float(np.sqrt(np.sum(residuals**2) / (levels.size - 2))),
+            residual_max=float(np.abs(residuals).max()),
+        )
+    except ValidationError:
+        line = f"{gain:.3g} * command {offset:+.3g} {unit}"
+        hint = "Check device.amplifier, device.measure and their wiring"
+        raise RunError(f"{recording}: the read-back is not the command: {line}. {hint}") from None
     return CalibrationFit(fitted, command, measured, residuals)
 
 

@@ -39,7 +39,8 @@ def test_a_file_is_read_as_it_was_written(text):
     (TABLE.replace("[-50.0, 50.0]", "[-50.0, 50.1]"), "sensor"),
     (TABLE.replace("[0, 2]", "[0, 60]"), "sensor"),
     (TABLE + "  polynomial: [1.0, 1.0]\n", "sensor"),
-    (AMPLIFIER.replace("1.02", "0"), "amplifier.gain"),
+    (AMPLIFIER.replace("1.02", "0.5"), "amplifier.gain"),
+    (AMPLIFIER.replace("0.01", "2.1"), "amplifier"),
     ("{}", ""),
 ])  # fmt: skip
 def test_a_broken_rule_is_named_with_its_key(text, key):

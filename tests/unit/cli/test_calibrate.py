@@ -28,6 +28,4 @@ def test_a_sensor_is_calibrated_once(hilctl, pairs, tmp_path):
     written = load_document(output).validate(CalibrationFile).sensor
     assert (written.by, written.reference, written.range_um) == (ORIGIN[1], ORIGIN[3], (0.0, 4.0))
     assert hilctl(*arguments)[0] == 2
-    code, shown, _ = hilctl(*arguments, "--overwrite")
-    assert code == 0
-    assert "order 1" in shown
+    assert hilctl(*arguments, "--overwrite")[0] == 0

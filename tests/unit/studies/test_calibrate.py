@@ -127,8 +127,9 @@ def test_gain_and_offset_of_the_read_back(tmp_path, monkeypatch):
     assert fit.fitted.residual_max < 1e-3
 
 
-def test_a_read_back_without_the_command_is_refused(tmp_path, monkeypatch):
-    spoiled(monkeypatch, -1.0, 0.0)
+@pytest.mark.parametrize(("gain", "offset"), [(-1.0, 0.0), (0.5, 0.0), (1.0, 2.0), (np.nan, 0.0)])
+def test_a_read_back_without_the_command_is_refused(tmp_path, monkeypatch, gain, offset):
+    spoiled(monkeypatch, gain, offset)
     with pytest.raises(RunError, match=r"device\.measure"):
         amplifier(tmp_path)
 
@@ -149,6 +150,6 @@ def test_a_file_keeps_its_other_part(tmp_path):
         write_calibration(path, fitted, before)
     content = load_document(path).validate(CalibrationFile)
     assert (content.sensor, content.amplifier) == (sensor, line)
-    with pytest.raises(InputError, match="exists already"):
+    with pytest.raises(InputError, match=path.name):
         existing_calibration(path, "sensor", [], overwrite=False)
     assert existing_calibration(path, "sensor", [], overwrite=True) == content

@@ -228,7 +228,7 @@ def test_a_reading_out_of_the_calibrated_range_is_its_end(calibration):
 
 def test_a_simulated_device_has_no_amplifier_to_calibrate(calibration):
     calibration.write_text(CALIBRATION + AMPLIFIER)
-    with pytest.raises(InputError, match="remove amplifier"):
+    with pytest.raises(InputError, match="amplifier"):
         terfenol(calibration=str(calibration))
 
 
