@@ -16,7 +16,7 @@ from hilctl.ilc.ilc_session import IlcSession
 from hilctl.ilc.results import IlcResult, IlcRow
 from hilctl.recording.run_summary import recordings_in
 from hilctl.run.control.client import finish_dead_runs
-from hilctl.run.start import paced, unpaced
+from hilctl.run.start import paced, unpaced, unused
 from hilctl.studies.calibrate import (
     CalibrationFit,
     Origin,
@@ -77,7 +77,7 @@ def calibrate_sensor(
         InputError: The table is invalid, or the file cannot be written.
     """
     file, origin = Path(output), Origin(datetime.now(UTC).date(), by, reference)
-    before = existing_calibration(file, "sensor", [Path(table)], overwrite=overwrite)
+    before = existing_calibration(file, "sensor", overwrite=overwrite)
     points = sensor_points(Path(table), (reading_column, true_column))
     found = fit_sensor(str(table), *points, origin)
     write_calibration(file, found.fitted, before)
@@ -99,13 +99,13 @@ def calibrate_amplifier(
 
     Args:
         experiment: Experiment file with device and limits.
-        output: Calibration file to write; its calibration of a sensor is kept. The recording has
-            the same name.
+        output: Calibration file to write; its calibration of a sensor is kept. The recording is
+            a new file beside it, ``OUTPUT-run.mcap``.
         by: Operator.
         reference: Instrument that reads the command back.
         settings: Overrides of the experiment.
         fast: Simulate without waiting; simulated devices only.
-        overwrite: Replace the calibration of an amplifier in the file, and the recording.
+        overwrite: Replace the calibration of an amplifier in the file.
         on_progress: Called with the fraction done (0 to 1) and the current step.
 
     Raises:
@@ -114,13 +114,11 @@ def calibrate_amplifier(
     """
     path, texts, file = Path(experiment), texts_of(settings), Path(output)
     origin = Origin(datetime.now(UTC).date(), by, reference)
-    recording = file.with_suffix(".mcap")
-    inputs = inputs_of(path, texts)
-    before = existing_calibration(file, "amplifier", inputs[:1], overwrite=overwrite)
-    check_writable(recording, overwrite=overwrite, inputs=inputs)
+    before = existing_calibration(file, "amplifier", overwrite=overwrite)
     finish_dead_runs()
     host = StudyHost(run=unpaced if fast else paced, on_progress=on_progress)
-    found = measure_amplifier(path, texts, recording, origin, host, overwrite=overwrite)
+    recording = unused(file.with_name(f"{file.stem}-run.mcap"), "-")
+    found = measure_amplifier(path, texts, recording, origin, host)
     write_calibration(file, found.fitted, before)
     return found
 

@@ -161,8 +161,6 @@ def measure_amplifier(
     recording: Path,
     origin: Origin,
     host: StudyHost,
-    *,
-    overwrite: bool,
 ) -> CalibrationFit:
     """Step the command within a tenth of its limits, and fit gain and offset of its read-back.
 
@@ -192,7 +190,7 @@ def measure_amplifier(
         [*settings, setting("waveform", steps | times)],
         recording,
         lambda part: host.on_progress(part, "steps"),
-        overwrite=overwrite,
+        overwrite=False,
     )
     raise_if_stopped("calibrate", result)
     if result.code != "completed":
@@ -228,16 +226,14 @@ def measure_amplifier(
     return CalibrationFit(fitted, command, measured, residuals)
 
 
-def existing_calibration(
-    path: Path, part: str, inputs: Sequence[Path], *, overwrite: bool
-) -> CalibrationFile | None:
+def existing_calibration(path: Path, part: str, *, overwrite: bool) -> CalibrationFile | None:
     """Return the calibration in the file to write, None without one.
 
     Raises:
         InputError: It has this part already, is something else, or cannot be written.
     """
     if not path.exists():
-        check_writable(path, overwrite=overwrite, inputs=inputs)
+        check_writable(path, overwrite=overwrite)
         return None
     before = load_document(path).validate(CalibrationFile)
     check_writable(path, overwrite=overwrite or getattr(before, part) is None)

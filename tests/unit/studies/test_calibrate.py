@@ -105,7 +105,7 @@ def test_an_unusable_table_is_refused(tmp_path, text):
 
 def amplifier(tmp_path):
     slow = ("sample_rate_hz=1000", "block=10")
-    return measure_amplifier(RIG, slow, tmp_path / "run.mcap", ORIGIN, HOST, overwrite=False)
+    return measure_amplifier(RIG, slow, tmp_path / "run.mcap", ORIGIN, HOST)
 
 
 def spoiled(monkeypatch, gain, offset):
@@ -137,7 +137,7 @@ def test_a_read_back_without_the_command_is_refused(tmp_path, monkeypatch, gain,
 def test_a_device_that_does_not_measure_is_refused(tmp_path):
     rig = RIG.with_name("modbus_labjack_t7.yaml")
     with pytest.raises(InputError, match=r"device\.measure"):
-        measure_amplifier(rig, (), tmp_path / "run.mcap", ORIGIN, HOST, overwrite=False)
+        measure_amplifier(rig, (), tmp_path / "run.mcap", ORIGIN, HOST)
     assert not any(tmp_path.iterdir())
 
 
@@ -146,10 +146,10 @@ def test_a_file_keeps_its_other_part(tmp_path):
     sensor = fit_sensor("pairs", linear(TRUE), TRUE, ORIGIN).fitted
     line = amplifier(tmp_path).fitted
     for part, fitted in (("sensor", sensor), ("amplifier", line)):
-        before = existing_calibration(path, part, [], overwrite=False)
+        before = existing_calibration(path, part, overwrite=False)
         write_calibration(path, fitted, before)
     content = load_document(path).validate(CalibrationFile)
     assert (content.sensor, content.amplifier) == (sensor, line)
     with pytest.raises(InputError, match=path.name):
-        existing_calibration(path, "sensor", [], overwrite=False)
-    assert existing_calibration(path, "sensor", [], overwrite=True) == content
+        existing_calibration(path, "sensor", overwrite=False)
+    assert existing_calibration(path, "sensor", overwrite=True) == content
