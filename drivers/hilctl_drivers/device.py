@@ -55,8 +55,6 @@ class DacDevice(ABC):
                 low_um, high_um = curve[1][[0, -1]].tolist()
                 info = replace(info, sensor_min_um=low_um, sensor_max_um=high_um)
                 self._curve = curve
-                # On the instance: an exchange without a calibration has no further step.
-                vars(self)["exchange"] = self._corrected_exchange
         self._info = info
         self._title = title
         self._action = action
@@ -164,18 +162,10 @@ class DacDevice(ABC):
             self._exchange(first_sample, command, displacement_um, measured)
         except DeviceError as error:
             raise self._failed(self._action, error, self._abandon) from None
-
-    def _corrected_exchange(
-        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
-    ) -> None:
-        """Exchange a block and correct its readings; one out of range becomes the range's end.
-
-        The sensor's range in :attr:`info` is the corrected one, so its ends are invalid readings.
-        """
-        assert self._curve is not None
-        type(self).exchange(self, first_sample, command, displacement_um, measured)
-        self.reading_um = displacement_um.copy()
-        displacement_um[:] = np.interp(displacement_um, *self._curve)
+        if self._curve is not None:
+            # A reading out of range becomes an end of the corrected range, which is invalid.
+            self.reading_um = displacement_um.copy()
+            displacement_um[:] = np.interp(displacement_um, *self._curve)
 
     def make_safe(self, command: float) -> None:
         """Set the output to ``command`` in one attempt and disconnect; the watchdog stays armed.
