@@ -11,6 +11,8 @@ PUBLIC = (
     "report",
     "report_table",
     "run_metrics",
+    "response.bode",
+    "response.frequency_response",
     "run_page",
     "steady_state",
 )

@@ -190,6 +190,14 @@ DEFINITIONS = {
         "Largest difference of the measured displacement and that of the model, over the "
         "peak-to-peak displacement."
     ),
+    "coherence": (
+        "Share of the output's power that a linear response to the input explains, per frequency."
+    ),
+    "lines not excited": (
+        "Output between the excited frequencies of a multisine, rms per line, in percent of the "
+        "excited lines: above the noise it is nonlinear distortion, at even and odd multiples of "
+        "the lowest common frequency."
+    ),
     "harmonics of the error": (
         "Amplitudes of the error's steady part at multiples of the waveform's frequency."
     ),

@@ -4,14 +4,13 @@ Long signals are reduced without hiding spikes or creating beats. The colours ar
 Ito, which colour-blind people can distinguish.
 """
 
-from collections.abc import Mapping
 from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
 from matplotlib.ticker import LogLocator, NullFormatter
 
-from hilctl.base.types import C128, F64, I64
+from hilctl.base.types import F64, I64
 from hilctl.recording.recording import Recording
 
 REFERENCE = "#000000"
@@ -122,22 +121,6 @@ def draw_line(
     width, style = (0.9, "--") if dashed else (1.5, "-")
     name = label or "_unnamed"  # matplotlib leaves labels with an underscore out of legends
     axes.plot(*min_max(t, values), color=colour, linestyle=style, linewidth=width, label=name)
-
-
-def draw_response(
-    axes: Axes, part: str, frequency_hz: F64, response: C128, unit: str, line: Mapping[str, Any]
-) -> None:
-    """Draw the ``magnitude`` or the ``phase`` of a response in um per unit of the input."""
-    if part == "magnitude":
-        axes.plot(frequency_hz, np.abs(response), **line)
-        axes.set_ylabel(f"magnitude, µm/{unit}")
-        low, high = axes.yaxis.get_data_interval()
-        axes.set_yscale("log" if high > 3.0 * low else "linear")
-    else:
-        axes.plot(frequency_hz, np.degrees(np.unwrap(np.angle(response))), **line)
-        axes.set_ylabel("phase, °")
-    axes.set(xscale="log", xlabel="frequency, Hz")
-    plain_numbers(axes)
 
 
 def plain_numbers(axes: Axes) -> None:

@@ -20,10 +20,11 @@ from hilctl.analysis.plot_style import (
     REFERENCE,
     draw_line,
     draw_over_time,
-    draw_response,
     plain_numbers,
 )
 from hilctl.analysis.quantiles import Quantiles
+from hilctl.analysis.response.bode import response_sheet
+from hilctl.analysis.response.frequency_response import frequency_response
 from hilctl.analysis.steady_state import (
     SteadyPart,
     loop_signals,
@@ -31,6 +32,7 @@ from hilctl.analysis.steady_state import (
     steady_samples,
     trusted,
 )
+from hilctl.base.errors import DataError
 from hilctl.base.formatting import quantity, short_name
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
@@ -48,7 +50,6 @@ _DECADES = 5.0  # of amplitude that a spectrum shows
 _LOW = 0.5
 _LARGEST_UM = 1e100  # larger readings have no spectrum
 _WIDEST_GAP = 0.02  # share of samples that may be missing
-_STRONG = 0.2  # of the largest line of an input: weaker ones have no response
 _SETTLED = 0.05  # of a step
 
 
@@ -316,30 +317,12 @@ def response(recording: Recording, focus: int = 0) -> FigureSpec | None:
     """Return displacement over input of a multisine or a random segment; None for others."""
     if focus >= len(recording.segments):
         return None
-    segment = recording.segments[focus]
-    samples = steady_samples(recording, segment)[0]
-    signals = loop_signals(samples, compensated=recording.compensated)
-    finite = np.isfinite(signals).all(axis=0)
-    found = [_even(samples.index[finite], each) for each in signals[:, finite]]
-    if segment.kind not in {"multisine", "random"} or found[0] is None or found[1] is None:
+    if recording.segments[focus].kind not in {"multisine", "random"}:
         return None
-    size = found[0][2].size
-    if segment.period > 0.0:  # whole periods need no window
-        size = round(size // segment.period * segment.period)
-    window = np.ones(size) if segment.period > 0.0 else np.hanning(size)
-    sent, moved = (
-        np.fft.rfft((each[2][-size:] - each[2][-size:].mean()) * window) for each in found if each
-    )
-    lines = np.flatnonzero(np.abs(sent) > _STRONG * np.abs(sent).max())
-    hz = lines.astype(np.float64) * (recording.sample_rate_hz / size)
-    answer = moved[lines] / sent[lines]
-    unit = "µm" if recording.compensated else recording.command_unit
-    line = {"color": DISPLACEMENT, "linestyle": "", "marker": "."}
-    draw = partial(draw_response, frequency_hz=hz, response=answer, unit=unit, line=line)
-    panels = Panel(partial(draw, part="magnitude")), Panel(partial(draw, part="phase"), height=_LOW)
-    over = "reference" if recording.compensated else "command"
-    caption = f"Response: displacement over {over}, at the frequencies of the {segment.kind}."
-    return FigureSpec("response", caption, panels, stacked=True)
+    try:
+        return response_sheet([frequency_response(recording)])
+    except DataError:  # below the noise, or too short
+        return None
 
 
 def lateness(recording: Recording) -> FigureSpec | None:

@@ -10,10 +10,16 @@ from hilctl.analysis.decimation import overview
 from hilctl.analysis.figure_layout import FigureSpec, formats_of
 from hilctl.analysis.replay import ReplayResult
 from hilctl.analysis.replay import replay as recompute
+from hilctl.analysis.response.bode import write_responses
+from hilctl.analysis.response.frequency_response import (
+    FrequencyResponse,
+    Signals,
+    frequency_response,
+)
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.run_page import run_sheets, write_html
 from hilctl.api._types import PathLike, Paths, paths_of
-from hilctl.api.recordings import RecordedRun, stream_of
+from hilctl.api.recordings import RecordedRun, read, stream_of
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable
 from hilctl.models.model_file import load_model
@@ -52,6 +58,37 @@ def report_page(
     summary, shown = overview(stream_of(run, from_s, to_s))
     write_html(shown, summary, page, earlier)
     return summary
+
+
+def frf(
+    runs: Paths,
+    html: PathLike | None = None,
+    *,
+    signals: Signals | None = None,
+    overwrite: bool = False,
+) -> tuple[FrequencyResponse, ...]:
+    """Return the frequency response of each run, and write their page with a Bode plot.
+
+    The last multisine, random or chirp segment is evaluated; without one, all sines together.
+
+    Args:
+        runs: Recordings.
+        html: Page to write, if any.
+        signals: Input and output: ``command-displacement``, ``reference-displacement`` (default
+            with a compensator) or ``command-measured``.
+        overwrite: Replace an existing page.
+
+    Raises:
+        InputError: A file does not exist, the signals are not recorded, or the page cannot be
+            written.
+        DataError: A file is not a recording, or has no frequency response above the noise.
+    """
+    if html is not None:
+        check_writable(Path(html), overwrite=overwrite)
+    found = tuple(frequency_response(read(each).recording, signals) for each in paths_of(runs))
+    if html is not None:
+        write_responses(found, Path(html))
+    return found
 
 
 def report_runs(

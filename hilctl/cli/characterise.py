@@ -1,4 +1,4 @@
-"""The command ``hilctl characterise``."""
+"""Commands that measure an actuator: characterise, frf."""
 
 import shlex
 import signal
@@ -7,12 +7,25 @@ from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+from rich.console import Group
 
 from hilctl import api
+from hilctl.analysis.response.bode import fit_rows, line_table
+from hilctl.analysis.response.frequency_response import FrequencyResponse, Signals
 from hilctl.api._types import runs_folder
 from hilctl.base.errors import RunError
-from hilctl.cli.console import print_rich, progress_bar, table
-from hilctl.cli.options import AsJson, DryRun, ExperimentFile, Fast, LabelTexts, Overwrite, Settings
+from hilctl.base.formatting import printable
+from hilctl.cli.console import listing, print_rich, progress_bar, table
+from hilctl.cli.options import (
+    AsJson,
+    DryRun,
+    ExperimentFile,
+    Fast,
+    LabelTexts,
+    Overwrite,
+    Settings,
+    recording_paths,
+)
 from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.sections import label_settings
 from hilctl.run.start import StepStoppedError
@@ -156,3 +169,37 @@ def print_characterisation(result: Characterisation, model: Path | None, page: P
     if model is not None:
         print(f"model: {model}")
     print(f"page: {page}")
+
+
+def frf(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Recordings (MCAP) of a multisine, random, chirp, or sines in sequence.",
+            metavar="RUN",
+            autocompletion=recording_paths,
+        ),
+    ],
+    signals: Annotated[
+        Signals | None,
+        typer.Option(
+            help="Input and output; default: from the reference with a compensator, otherwise from"
+            " the command."
+        ),
+    ] = None,
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="HTML page with a Bode plot to write.")
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the frequency response of runs: gain, phase, coherence, resonance."""
+    found = api.frf(runs, html, signals=signals, overwrite=overwrite)
+    values = {"responses": [each.to_mapping() for each in found]}
+    print_result(values, lambda: print_rich(*map(render_response, found)), as_json=as_json)
+
+
+def render_response(found: FrequencyResponse) -> Group:
+    """Return the fit and a table of a frequency response."""
+    lines = table("", *line_table(found))
+    return Group(listing(printable(str(found.path)), fit_rows(found)), lines)

@@ -69,7 +69,8 @@ _MODULES = {
     },
     "hilctl.cli.characterise": {
         "characterise": "Measure a connected actuator within its limits, "
-        "then identify and validate a model."
+        "then identify and validate a model.",
+        "frf": "Measure the frequency response of runs: gain, phase, coherence, resonance.",
     },
     "hilctl.cli.campaigns": {
         "campaign": "Run an experiment with each combination of varied keys "

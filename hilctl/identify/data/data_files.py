@@ -210,8 +210,14 @@ def from_known_state(history: History) -> History:
 _MOST_MISSING = 0.01  # share of samples
 
 
-def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]:
-    """Return every command and displacement in [start, stop), with gaps filled.
+def without_gaps(
+    recording: Recording,
+    start: int,
+    stop: int,
+    held: str = "command",
+    interpolated: str = "displacement_um",
+) -> tuple[F64, F64]:
+    """Return every value of two columns in [start, stop), with gaps filled.
 
     The command is held, as the device holds its output in skipped ticks. The displacement in um is
     interpolated: it approaches that of the held command, which the next sample still shows.
@@ -220,7 +226,7 @@ def without_gaps(recording: Recording, start: int, stop: int) -> tuple[F64, F64]
         DataError: More than 1 % of the samples are missing or have no displacement.
     """
     samples = recording.samples.part(start, stop)
-    signals = samples.index, samples.command, samples.displacement_um
+    signals = samples.index, samples.column(held), samples.column(interpolated)
     return _filled(recording.path, *signals, np.arange(start, stop))
 
 

@@ -7,6 +7,7 @@ from typing import Any
 
 import numpy as np
 
+from hilctl.analysis.response.frequency_response import FrequencyResponse
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
 from hilctl.identify.data.data_files import without_gaps
@@ -26,11 +27,7 @@ from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
 from hilctl.studies.characterise.loops import LoopFigures, Repeatability, ReversalCurves
-from hilctl.studies.characterise.response import (
-    RestNoise,
-    SmallSignal,
-    StepResponseCheck,
-)
+from hilctl.studies.characterise.response import RestNoise, StepResponseCheck
 
 
 @dataclass(frozen=True, slots=True)
@@ -39,7 +36,7 @@ class Measured:
 
     rest: RestNoise | None = None
     reaction: StepResponseCheck | None = None  # first reaction and its polarity
-    small: SmallSignal | None = None  # small-signal response
+    small: FrequencyResponse | None = None  # small-signal response
     growing: tuple[LoopFigures, ...] = ()  # loops of growing amplitude
     slow: tuple[LoopFigures, ...] = ()  # loops at the lowest frequency
     fast: tuple[LoopFigures, ...] = ()  # loops at several frequencies
@@ -181,7 +178,7 @@ VALIDATED: Mapping[str, str] = {
 """Steps for validation only, with their labels, the most important first."""
 
 
-def identified(recordings: Mapping[str, Path], small: SmallSignal | None) -> Identification:
+def identified(recordings: Mapping[str, Path], small: FrequencyResponse | None) -> Identification:
     """Identify a model from complete histories; raise InputError if none can be identified."""
     # Small loops depend on the history of the actuator, which steady loops do not contain.
     fitted = parallel_map(read, [p for name, p in recordings.items() if name in FITTED])

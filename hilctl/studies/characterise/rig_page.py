@@ -14,13 +14,12 @@ from hilctl.analysis.figure_layout import FigureSpec, Panel
 from hilctl.analysis.plot_style import (
     DISPLACEMENT,
     ERROR,
-    MARK,
     NAMED,
     REFERENCE,
     draw_line,
-    draw_response,
     min_max,
 )
+from hilctl.analysis.response.bode import response_sheet
 from hilctl.base.formatting import quantity, significant
 from hilctl.base.types import F64
 from hilctl.identify.model_page import drawn_records, errors_by_stroke
@@ -28,34 +27,11 @@ from hilctl.identify.summary import HEADINGS, error_rows, summary
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import StagedModel
 from hilctl.studies.characterise.loops import LoopFigures, ReversalCurves
-from hilctl.studies.characterise.response import SmallSignal
 from hilctl.studies.characterise.results import Characterisation, Measured, ValidationReference
 from hilctl.studies.characterise.waveforms import CREEP_S
 
 _CLOSE = 0.02  # of the duration, to either side
 _SQUARE = 0.85
-
-
-def response_sheet(small: SmallSignal, band_hz: tuple[float, float], unit: str) -> FigureSpec:
-    """Return magnitude and phase of the small-signal response, measured and fitted."""
-
-    def draw(axes: Axes, part: str) -> None:
-        axes.axvspan(*band_hz, color="#eeeeee", zorder=0, label="band of the loops")
-        if small.natural_hz is not None:
-            axes.axvline(small.natural_hz, color=MARK, linestyle="--", label="resonance")
-        hz = small.frequency_hz
-        if part == "magnitude":
-            axes.errorbar(hz, np.abs(small.response), small.noise, fmt="none", ecolor=DISPLACEMENT)
-        measured = {"color": DISPLACEMENT, "linestyle": "", "marker": ".", "label": "measured"}
-        draw_response(axes, part, hz, small.response, unit, measured)
-        draw_response(axes, part, hz, small.fitted, unit, {"color": REFERENCE, "label": "fitted"})
-        axes.set_xlim(0.8 * hz[0], 1.2 * hz[-1])
-
-    panels = (
-        Panel(partial(draw, part="magnitude")),
-        Panel(partial(draw, part="phase"), height=0.45),
-    )
-    return FigureSpec("response", "Small-signal response.", panels, stacked=True)
 
 
 def loops_sheet(caption: str, loops: Sequence[LoopFigures], unit: str) -> FigureSpec:
@@ -232,7 +208,7 @@ def _sheets(found: Characterisation) -> Iterator[FigureSpec]:
     """Yield the figures of the measurements."""
     measured, unit = found.measured, found.unit
     if measured.small is not None:
-        yield response_sheet(measured.small, found.band_hz, unit)
+        yield response_sheet([measured.small], band_hz=found.band_hz)
     # Smaller loops would be hidden.
     large = 0.9 * max((each.amplitude for each in measured.fast), default=0.0)
     for caption, loops in (

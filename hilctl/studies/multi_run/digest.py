@@ -15,6 +15,7 @@ from scipy.optimize import least_squares
 
 from hilctl.analysis.plot_style import min_max
 from hilctl.analysis.report import summarize, worst_segment
+from hilctl.analysis.response.frequency_response import FrequencyResponse, frequency_response
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.steady_state import steady_part
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError
@@ -29,7 +30,6 @@ from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import parse_model
 from hilctl.recording.metadata_keys import HEAT_FACT, LabelValue
 from hilctl.recording.recording import Recording
-from hilctl.studies.characterise.response import RigProblemError, SmallSignal, small_signal
 from hilctl.studies.multi_run.minor_loops import minor_loops
 from hilctl.waveforms.spec import AnyWaveform, Multisine, Step
 
@@ -179,7 +179,7 @@ def _figures(
     recording: Recording,
     report: RunReport,
     worst: Segment | None,
-    structure: SmallSignal | Ringing | None,
+    structure: FrequencyResponse | Ringing | None,
 ) -> RunFigures:
     measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
     return RunFigures(
@@ -229,12 +229,12 @@ def _minor(loop_input: F64, output: F64) -> dict[str, float]:
     return found
 
 
-def _structure(recording: Recording, waveform: Any) -> SmallSignal | Ringing | None:
+def _structure(recording: Recording, waveform: Any) -> FrequencyResponse | Ringing | None:
     """Return natural frequency and damping, if the waveform is a multisine or a step."""
     if isinstance(waveform, Multisine):
         try:
-            return small_signal(recording)
-        except RigProblemError:  # below the noise
+            return frequency_response(recording)
+        except DataError:  # below the noise
             return None
     if not isinstance(waveform, Step):
         return None
@@ -321,7 +321,7 @@ class RunDigest:
     model_error_percent: float | None = None  # largest, of the peak-to-peak; None without a model
     # float64[2, k], time in s and um after the largest step, or empty
     step: F64 = field(default_factory=_NO_LOOP.copy)
-    response: SmallSignal | None = None  # small-signal response, or None
+    response: FrequencyResponse | None = None  # small-signal response, or None
 
     @property
     def is_plain_loop(self) -> bool:
@@ -352,7 +352,7 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
         figures=_figures(recording, report, worst, structure),
         **(_loop(recording, worst, model) if worst and worst.is_loop else {}),
         step=_shown_step(recording, waveform, structure),
-        response=structure if isinstance(structure, SmallSignal) else None,
+        response=structure if isinstance(structure, FrequencyResponse) else None,
     )
 
 
@@ -406,7 +406,7 @@ def _modelled(
 
 
 def _shown_step(
-    recording: Recording, waveform: Any, structure: SmallSignal | Ringing | None
+    recording: Recording, waveform: Any, structure: FrequencyResponse | Ringing | None
 ) -> F64:
     if not isinstance(waveform, Step) or not recording.segments:
         return _NO_LOOP.copy()

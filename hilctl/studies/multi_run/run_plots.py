@@ -1,6 +1,7 @@
 """Figures of runs side by side: loops, errors, step and frequency responses."""
 
 from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from dataclasses import replace
 from functools import partial
 from itertools import cycle
 from typing import Any, TypeAlias, TypeVar
@@ -18,9 +19,9 @@ from hilctl.analysis.plot_style import (
     QUIET,
     REFERENCE,
     WITHOUT,
-    draw_response,
     of_range,
 )  # fmt: skip
+from hilctl.analysis.response.bode import response_sheet
 from hilctl.base.formatting import quantity, significant
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.digest import RunDigest
@@ -301,29 +302,11 @@ def frequency_sheet(series: RunSeries) -> FigureSpec | None:
         return None
     shown = spread(runs)
     along = next((each for each in series.dimensions if each.numeric), None)
-    text = partial(_title, series)
-    panels = tuple(
-        Panel(partial(_draw_response, runs=shown, along=along, text=text, part=part), part)
-        for part in ("magnitude", "phase")
-    )
-    caption = "Small-signal response: measured (dots) and fitted (lines)."
-    return FigureSpec("frequency_response", caption, panels)
-
-
-def _draw_response(
-    axes: Axes,
-    runs: Sequence[Measured],
-    along: VariedParameter | None,
-    text: Callable[[SeriesRun], str],
-    part: str,
-) -> None:
-    values = [run.values.get(along.key) if along else text(run) for run, _ in runs]
+    values = [run.values.get(along.key) if along else _title(series, run) for run, _ in shown]
     look = looks(along, list(dict.fromkeys(values)))
-    for (run, digest), value in zip(runs, values, strict=True):
-        if (found := digest.response) is None:
-            continue
-        colour, unit = look[value]["color"], digest.command_unit
-        dots = {"color": colour, "marker": ".", "linestyle": "", "markersize": 2.0, "alpha": 0.7}
-        draw_response(axes, part, found.frequency_hz, found.response, unit, dots)
-        line = {"color": colour, "linewidth": 0.9, "label": text(run)}
-        draw_response(axes, part, found.frequency_hz, found.fitted, unit, line)
+    sheet = response_sheet(
+        [digest.response for _, digest in shown if digest.response is not None],
+        [_title(series, run) for run, _ in shown],
+        [look[value]["color"] for value in values],
+    )
+    return replace(sheet, name="frequency_response")

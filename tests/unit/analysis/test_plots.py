@@ -87,16 +87,12 @@ def test_the_largest_step_is_shown_until_it_settles(make_recording) -> None:
 
 @pytest.mark.parametrize(("label", "period"), [("multisine", PERIOD), ("random", 0.0)])
 def test_the_response_is_displacement_over_input(make_recording, label, period) -> None:
-    turns = np.arange(8000) / PERIOD
-    wave = np.sin(2.0 * np.pi * 3.0 * turns) + np.sin(2.0 * np.pi * 7.0 * turns + 1.0)
+    turns = np.outer([3, 7, 11, 16], np.arange(8000)) / PERIOD
+    wave = np.sin(2.0 * np.pi * turns).sum(axis=0)
     part = Segment(label, 0, 8000, 0, 8000, period)
     recording = make_recording(-2.5 * wave, command=wave, segments=[part])
-    magnitude, phase = drawn(plots.response(recording)).axes
-    hz, size = magnitude.lines[0].get_data()
-    assert {150.0, 350.0} <= set(np.round(hz, 6))
+    size = lines(drawn(plots.response(recording)).axes[0])["measured"].get_ydata()
     np.testing.assert_allclose(size, 2.5, rtol=1e-6)
-    np.testing.assert_allclose(np.abs(phase.lines[0].get_ydata()), 180.0)
-    assert magnitude.get_ylabel() == "magnitude, µm/A"
     assert plots.step_response(recording) is None
 
 

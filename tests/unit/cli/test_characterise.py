@@ -1,4 +1,4 @@
-"""The characterise command: output, files, refusals and exit codes."""
+"""The commands characterise and frf: output, files, refusals and exit codes."""
 
 import json
 from dataclasses import replace
@@ -11,8 +11,11 @@ from hilctl.cli.characterise import plan_mapping, print_characterisation, print_
 from hilctl.run.start import StepStoppedError, paced, unpaced
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.studies.characterise.results import Characterisation, StepRow
+from tests.unit.analysis.response.test_bode import SMALL
 from tests.unit.studies.characterise.conftest import experiment, limits, limits_with
 from tests.unit.studies.characterise.test_results import FOUND, identification
+
+RUN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 
 __all__ = ["experiment", "limits", "limits_with"]
 
@@ -164,3 +167,16 @@ def test_validation_error_is_printed_first(capsys):
     assert shown.index("random reference") < shown.index("noise at rest")
     assert "verdict: fit error" in shown
     assert "model: model.yaml" in shown
+
+
+def test_frequency_responses_are_tables_or_json(monkeypatch, tmp_path, hilctl, json_of):
+    monkeypatch.setattr("hilctl.api.frf", lambda runs, *_, **__: (SMALL,) * len(runs))
+    code, shown, _ = hilctl("frf", "a.mcap", "b.mcap")
+    assert code == 0
+    assert shown.count("natural frequency") == 2
+    assert max(map(len, shown.splitlines())) <= 80
+    assert json_of("frf", "a.mcap")[1]["responses"][0]["natural_hz"] == SMALL.natural_hz
+
+
+def test_a_run_without_a_frequency_response_is_refused(hilctl):
+    assert hilctl("frf", RUN)[0] == 2

@@ -2,7 +2,7 @@
 
 import numpy as np
 import pytest
-from scipy.signal import lfilter
+from scipy.signal import cont2discrete, lfilter
 
 from hilctl.base.segments import Segment
 from hilctl.models.linear_stages import CreepModel
@@ -110,12 +110,11 @@ RATE_HZ = 5000.0
 
 
 def resonator(natural_hz, damping_ratio):
-    """Return a second-order resonator of gain 1, with matched poles."""
-    pole = (
-        2.0 * np.pi * natural_hz / RATE_HZ * (-damping_ratio + 1j * np.sqrt(1 - damping_ratio**2))
-    )
-    a = np.real(np.poly([np.exp(pole), np.exp(pole.conjugate())]))
-    return lambda v: lfilter([a.sum()], a, v)
+    """Return a second-order resonator of gain 1, driven by held commands."""
+    omega = 2.0 * np.pi * natural_hz
+    continuous = [1.0], [omega**-2, 2.0 * damping_ratio / omega, 1.0]
+    b, a, _ = cont2discrete(continuous, 1.0 / RATE_HZ, method="zoh")
+    return lambda v: lfilter(b[0], a, v)
 
 
 def response(limits, played, actuator, noise_um=0.01):
@@ -140,7 +139,8 @@ def test_a_lag_and_a_delay_are_no_resonance(limits, played):
     )
     assert found.natural_hz is None
     assert found.lag_s == pytest.approx(1e-3, rel=0.2)
-    assert found.delay_s == pytest.approx(3.0 / RATE_HZ, abs=0.6 / RATE_HZ)
+    # These actuators answer at once: half a sample before the middle of a held command.
+    assert found.delay_s == pytest.approx(2.5 / RATE_HZ, abs=0.5 / RATE_HZ)
     assert found.gain_um == pytest.approx(4.0, rel=0.02)
 
 
@@ -150,7 +150,7 @@ def test_a_plain_gain_has_neither(limits, played, drift_um):
     assert found.natural_hz is None
     assert found.gain_um == pytest.approx(4.0, rel=0.02)
     assert found.lag_s < 2e-5
-    assert abs(found.delay_s) < 0.1 / RATE_HZ
+    assert found.delay_s == pytest.approx(-0.5 / RATE_HZ, abs=0.1 / RATE_HZ)
 
 
 def test_noise_over_everything_is_a_problem(limits, played):

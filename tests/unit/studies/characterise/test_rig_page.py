@@ -10,27 +10,10 @@ from hilctl.models.linear_stages import FurtherMode
 from hilctl.models.staged import StagedModel
 from hilctl.studies.characterise import rig_page
 from hilctl.studies.characterise.loops import ReversalCurves
-from hilctl.studies.characterise.response import SmallSignal
 from hilctl.studies.characterise.results import Measured, StepRow
 from tests.published import piezo_ppi
+from tests.unit.analysis.response.test_bode import SMALL
 from tests.unit.studies.characterise.test_results import FOUND, LOOP, UNSEEN, identification
-
-HZ = np.geomspace(10.0, 1000.0, 30)
-SMALL = SmallSignal(
-    HZ, 4.0 / (1.0 + 1j * HZ / 300.0), np.full(30, 0.1), 0.2, 4.0, 1e-4, 5e-4, 700.0, 0.1, 1.0,
-    4.0 / (1.0 + 1j * HZ / 300.0),
-)  # fmt: skip
-
-
-def test_the_response_shows_band_and_resonance():
-    upper, lower = drawn(rig_page.response_sheet(SMALL, (1.0, 50.0), "A")).axes
-    assert upper.get_ylabel() == "magnitude, µm/A"
-    assert any(np.allclose(line.get_xdata(), 700.0) for line in upper.lines)
-    np.testing.assert_allclose(lower.lines[1].get_ydata()[-1], np.degrees(-np.arctan(1000 / 300)))
-    assert (
-        len(drawn(rig_page.response_sheet(replace(SMALL, natural_hz=None), (1.0, 50.0), "A")).axes)
-        == 2
-    )
 
 
 def test_loops_are_closed_and_drawn_over_the_command():

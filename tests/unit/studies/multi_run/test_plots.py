@@ -6,10 +6,10 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.studies.characterise.response import SmallSignal
 from hilctl.studies.multi_run import plots
 from hilctl.studies.multi_run.collect import RunSeries
 from hilctl.studies.multi_run.digest import RunFigures
+from tests.unit.analysis.response.test_bode import SMALL
 from tests.unit.studies.multi_run.conftest import digest, drawn, grown
 
 
@@ -88,8 +88,8 @@ def test_they_are_found_from_what_varied(crossed, compensated):
         assert [sheet.name for sheet in plots.sheets_of(series)] == names.split()
 
 
-def series(run):
-    return RunSeries("loads", (run,), ("waveform.amplitude",))
+def series(*runs):
+    return RunSeries("loads", runs, ("waveform.amplitude",))
 
 
 def test_a_step_with_its_resonance():
@@ -103,16 +103,11 @@ def test_a_step_with_its_resonance():
     assert axes.texts[0].get_text() == "470 Hz, damping ratio 0.120"
 
 
-def test_magnitude_and_phase_measured_and_fitted():
-    frequency_hz = np.array([10.0, 100.0, 1000.0])
-    answer = 4.0 / (1.0 + 1j * frequency_hz / 100.0)
-    small = SmallSignal(frequency_hz, answer, np.full(3, 0.1), 1.0, 4.0, 0.0, 0.0, None, None, 1.0,
-                        answer)  # fmt: skip
-    run = grown(1.0, 10.0, digest=digest(response=small))
-    magnitude, phase = map(drawn, plots.frequency_sheet(series(run)).panels)
-    assert magnitude.get_ylabel() == "magnitude, µm/A"
-    assert np.allclose(magnitude.lines[0].get_ydata(), np.abs(answer))
-    assert np.allclose(phase.lines[1].get_ydata()[1], -45.0)
+def test_responses_have_the_names_of_their_runs():
+    runs = [grown(a, 10.0, digest=digest(response=SMALL)) for a in (1.0, 2.0)]
+    sheet = plots.frequency_sheet(series(*runs))
+    names = [line.get_label() for line in drawn(sheet.panels[0]).lines[1::2]]
+    assert names == ["1 A", "2 A"]
 
 
 @pytest.mark.slow

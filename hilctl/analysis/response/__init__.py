@@ -1,0 +1,1 @@
+"""Frequency response: measurement and fit, Bode plot and page."""

@@ -1,0 +1,484 @@
+"""Frequency response of a recording: multisine, random, chirp or a sequence of sines, and its fit.
+
+The displacement of a sample is read when its command is output. Each command is held for a sample,
+which delays the response from it by half a sample and attenuates high frequencies; the fit contains
+both, and the fitted delay and lag do not.
+
+Sources: R. Pintelon, J. Schoukens, System Identification: A Frequency Domain Approach (2012), for
+periodic excitation and free lines; J. S. Bendat, A. G. Piersol, Random Data (2010), for the errors
+of averaged spectra.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass, fields, replace
+from pathlib import Path
+from typing import Any, Literal, NamedTuple, TypeAlias, get_args
+
+import numpy as np
+from scipy import signal
+from scipy.optimize import OptimizeResult, least_squares
+
+from hilctl.analysis.steady_state import steady_part, steady_samples
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.formatting import shown_briefly
+from hilctl.base.segments import Segment
+from hilctl.base.types import C128, F64, I64
+from hilctl.identify.data.data_files import without_gaps
+from hilctl.ilc.cycle import coefficients
+from hilctl.models.linear_stages import FirstMode
+from hilctl.recording.recording import Recording
+
+Signals: TypeAlias = Literal["command-displacement", "reference-displacement", "command-measured"]
+Method: TypeAlias = Literal["periods", "averaged spectra", "sines"]
+SIGNALS: tuple[Signals, ...] = get_args(Signals)
+
+_FEWEST_LINES = 4
+_FEWEST_PERIODS = 2
+_STRONG = 0.2  # of the largest line of a multisine's input: excited
+_WEAK = 1e-4  # of the largest power of another input: not excited
+_AVERAGES = {"chirp": 4}  # segments that fit side by side; overlapping, nearly twice as many
+_MOST_AVERAGES = 16  # the same of other waveforms; a resonance must decay within a segment
+_OVERLAP = 1.056  # loss of averages, because half of each Hann window is in the next one
+_USABLE = 0.3  # largest relative noise of a line
+_HYSTERESIS = 0.03  # of a line, that no linear response explains
+_WORTH = 0.5  # of the misfit that a resonance must explain
+_MOST_DAMPING = 0.8
+_CURVE_POINTS = 2000
+_FITTED = ("gain_um", "delay_s", "lag_s", "natural_hz", "damping_ratio")
+
+
+class NoisyResponseError(DataError):
+    """Too few frequencies are above the noise."""
+
+
+@dataclass(frozen=True, slots=True)
+class FreeLines:
+    """Output at lines that a multisine does not excite, rms per line, in percent of excited lines.
+
+    Output above the noise is nonlinear distortion; nan without such lines.
+    """
+
+    even_percent: float
+    odd_percent: float
+    noise_percent: float
+
+
+@shown_briefly
+@dataclass(frozen=True, slots=True)
+class FrequencyResponse:
+    """Frequency response of a run.
+
+    Attributes:
+        path: The recording.
+        signals: Input and output.
+        unit: Unit of the response, such as ``um/A``.
+        excitation: The excitation in words.
+        method: Evaluation of the excitation.
+        averages: Number of periods or averaged spectra, or the fewest cycles of a sine.
+        amplitude: Half the peak-to-peak of the input.
+        excited_lines: Number of excited frequencies.
+        frequency_hz: float64[k], those above the noise.
+        response: complex128[k], output over input as sampled (H1).
+        noise: float64[k], standard deviation of each.
+        coherence: float64[k], 0 to 1.
+        free: Output at lines that are not excited; None unless a multisine leaves some.
+        gain_um: Gain at low frequencies, in ``unit``; negative if the output falls.
+        delay_s: Delay, without the half sample by which holding each command delays it.
+        lag_s: Time constant of a first-order lag; 0 for none.
+        natural_hz: Natural frequency; None without a resonance.
+        damping_ratio: Its damping ratio; None without a resonance.
+        bandwidth_hz: -3 dB bandwidth; None if it is above the measured frequencies.
+        errors: Standard errors of the fit, by the names of these fields.
+        misfit_percent: rms residual of the fit, of the gain.
+        fitted: complex128[k], the fitted response.
+    """
+
+    path: Path
+    signals: Signals
+    unit: str
+    excitation: str
+    method: Method
+    averages: int
+    amplitude: float
+    excited_lines: int
+    frequency_hz: F64
+    response: C128
+    noise: F64
+    coherence: F64
+    free: FreeLines | None
+    gain_um: float
+    delay_s: float
+    lag_s: float
+    natural_hz: float | None
+    damping_ratio: float | None
+    bandwidth_hz: float | None
+    errors: Mapping[str, float]
+    misfit_percent: float
+    fitted: C128
+
+    @property
+    def structure(self) -> FirstMode | None:
+        """The resonance as a stage of a model; None without one."""
+        if self.natural_hz is None or self.damping_ratio is None:
+            return None
+        return FirstMode(natural_hz=self.natural_hz, damping_ratio=self.damping_ratio)
+
+    @property
+    def quality(self) -> float | None:
+        """Quality factor Q of the resonance; None without one."""
+        return 0.5 / self.damping_ratio if self.damping_ratio else None
+
+    @property
+    def h2(self) -> C128:
+        """The estimate H2, without bias by noise of the input: complex128[k]."""
+        return self.response / self.coherence
+
+    @property
+    def phase_deg(self) -> F64:
+        """Continuous phase: float64[k]."""
+        return np.degrees(np.unwrap(np.angle(self.response)))
+
+    def size_at(self, frequency_hz: float) -> float:
+        """Return the fitted magnitude at a frequency, over that at the lowest line."""
+        size = np.abs(self.fitted)
+        return float(np.interp(frequency_hz, self.frequency_hz, size) / size[0])
+
+    def to_scipy(self) -> signal.TransferFunction:
+        """Return the fit without its delay as a continuous transfer function."""
+        poles = np.array([self.lag_s, 1.0]) if self.lag_s else np.ones(1)
+        if (mode := self.structure) is not None:
+            omega = 2.0 * math.pi * mode.natural_hz
+            poles = np.polymul(poles, [omega**-2, 2.0 * mode.damping_ratio / omega, 1.0])
+        return signal.TransferFunction([self.gain_um], poles)
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values, as ``hilctl frf --json`` prints them."""
+        found = {each.name: getattr(self, each.name) for each in fields(self)}
+        del found["response"], found["fitted"]
+        arrays = {
+            "frequency_hz": self.frequency_hz,
+            "magnitude": np.abs(self.response),
+            "phase_deg": self.phase_deg,
+            "coherence": self.coherence,
+            "noise": self.noise,
+        }
+        return {
+            **found,
+            "path": str(self.path),
+            "quality": self.quality,
+            "errors": dict(self.errors),
+            "free": self.free and asdict(self.free),
+            **{name: values.tolist() for name, values in arrays.items()},
+        }
+
+
+class _Lines(NamedTuple):
+    """Response at the excited frequencies."""
+
+    frequency_hz: F64
+    response: C128
+    noise: F64
+    coherence: F64
+    amplitude: float
+    averages: int
+    free: FreeLines | None = None
+
+
+class _Columns(NamedTuple):
+    """Columns of input and output."""
+
+    sent: str
+    answered: str
+
+
+def frequency_response(recording: Recording, signals: Signals | None = None) -> FrequencyResponse:
+    """Return the response of a run's last multisine, random or chirp segment, or of all its sines.
+
+    Raises:
+        InputError: The signals are not recorded.
+        DataError: The run has no such segment, or too many samples are missing.
+        NoisyResponseError: Too few frequencies are above the noise.
+    """
+    default = SIGNALS[1] if recording.compensated else SIGNALS[0]
+    signals = signals or default
+    columns = _columns(recording, signals)
+    segments, method = _excitation(recording)
+    if method == "sines":
+        lines = _sines(recording, segments, columns)
+    else:
+        lines, method = _broad(recording, segments[0], columns, method)
+    excited = lines.frequency_hz.size
+    usable = lines.noise < _USABLE * np.abs(lines.response)
+    if np.count_nonzero(usable) < _FEWEST_LINES:
+        raise NoisyResponseError(
+            f"{recording.path}: only {np.count_nonzero(usable)} of {excited} frequencies are above"
+            f" the noise, fewer than {_FEWEST_LINES}: increase the amplitude or the duration"
+        )
+    hz, response, noise = lines.frequency_hz[usable], lines.response[usable], lines.noise[usable]
+    units = {"command": recording.command_unit, "measured": recording.command_unit}
+    excitation = segments[0].label
+    if method == "sines":
+        excitation = f"{len(segments)} sines {hz[0]:g}-{hz[-1]:g} Hz"
+    return FrequencyResponse(
+        path=recording.path,
+        signals=signals,
+        unit="/".join(units.get(each, "um") for each in reversed(columns)),
+        excitation=excitation,
+        method=method,
+        averages=lines.averages,
+        amplitude=lines.amplitude,
+        excited_lines=excited,
+        frequency_hz=hz,
+        response=response,
+        noise=noise,
+        coherence=lines.coherence[usable],
+        free=lines.free,
+        **_fit(hz, response, noise, recording.sample_rate_hz, held=columns.sent == "command"),
+    )
+
+
+def _columns(recording: Recording, signals: Signals) -> _Columns:
+    names = {"displacement": "displacement_um", "reference": "reference_um"}
+    columns = _Columns(*(names.get(each, each) for each in signals.split("-")))
+    for name in columns:
+        if not np.isfinite(recording.samples.column(name)).any():
+            raise InputError(f"{recording.path}: {name} is not recorded: use other --signals")
+    return columns
+
+
+def _excitation(recording: Recording) -> tuple[list[Segment], Method]:
+    """Return the evaluated segments and the method."""
+    kinds: dict[str, Method] = {
+        "multisine": "periods",
+        "random": "averaged spectra",
+        "chirp": "averaged spectra",
+    }
+    broad = [each for each in recording.segments if each.kind in kinds]
+    if broad:
+        return broad[-1:], kinds[broad[-1].kind]
+    sines = [each for each in recording.segments if each.kind == "sine"]
+    if len({each.period for each in sines}) >= _FEWEST_LINES:
+        return sorted(sines, key=lambda each: -each.period), "sines"
+    found = ", ".join(each.label for each in recording.segments) or "no waveform"
+    raise DataError(
+        f"{recording.path}: has no multisine, random or chirp segment, and no {_FEWEST_LINES} sines"
+        f" of different frequency ({found}): record one, as in hilctl examples frequency_response"
+    )
+
+
+def _broad(
+    recording: Recording, segment: Segment, columns: _Columns, method: Method
+) -> tuple[_Lines, Method]:
+    """Return the lines of one segment, from whole periods if it has them."""
+    samples = steady_part(recording, segment).samples
+    if not samples.index.size:
+        raise DataError(f"{recording.path}: {segment.label}: no steady sample is recorded")
+    start, stop = int(samples.index[0]), int(samples.index[-1]) + 1
+    period = round(segment.period)
+    periods = (stop - start) // period if abs(segment.period - period) < 1e-6 and period else 0
+    if periods < _FEWEST_PERIODS:
+        method = "averaged spectra"
+    else:
+        start = stop - periods * period
+    sent, answered = without_gaps(replace(recording, samples=samples), start, stop, *columns)
+    if method == "periods":
+        return _periods(sent, answered, periods, recording.sample_rate_hz), method
+    size = sent.size // _AVERAGES.get(segment.kind, _MOST_AVERAGES)
+    return _averaged(sent, answered, size, recording.sample_rate_hz), method
+
+
+def _periods(sent: F64, answered: F64, periods: int, rate_hz: float) -> _Lines:
+    """Return the lines of a multisine from whole periods, with their scatter."""
+    period = sent.size // periods
+    shape = periods, period
+    # Drift between periods: a line through the samples would remove low frequencies.
+    means = answered.reshape(shape).mean(axis=1)
+    slope = np.polynomial.polynomial.polyfit(np.arange(periods), means, 1)[1]
+    answered = answered - slope * np.arange(answered.size) / period
+    x, y = np.fft.rfft(sent.reshape(shape)), np.fft.rfft(answered.reshape(shape))
+    size = np.abs(x.mean(axis=0))
+    size[0] = 0.0
+    excited = np.flatnonzero(size > _STRONG * size.max())
+    response, noise, coherence = _scattered(x[:, excited], y[:, excited])
+    spectra = y.mean(axis=0), np.sum(np.abs(y - y.mean(axis=0)) ** 2, axis=0)
+    variance = spectra[1] / (periods * (periods - 1))
+    return _Lines(
+        excited * rate_hz / period,
+        response,
+        noise,
+        coherence,
+        0.5 * float(np.ptp(sent)),
+        periods,
+        _free_lines(excited, np.abs(spectra[0]) ** 2, variance),
+    )
+
+
+def _scattered(x: C128, y: C128) -> tuple[C128, F64, F64]:
+    """Return response, noise and coherence of spectra of each period: complex128[periods, k]."""
+    periods = len(x)
+    cross, own = np.sum(np.conj(x) * y, axis=0), np.sum(np.abs(x) ** 2, axis=0)
+    response = cross / own
+    left = np.sum(np.abs(y - response * x) ** 2, axis=0)
+    noise = np.sqrt(left / ((periods - 1) * own))
+    coherence = np.abs(cross) ** 2 / (own * np.maximum(np.sum(np.abs(y) ** 2, axis=0), 1e-300))
+    return response, noise, coherence
+
+
+def _free_lines(excited: I64, power: F64, variance: F64) -> FreeLines | None:
+    """Evaluate the lines between the first and the last excited one by their average power."""
+    if not excited.size:
+        return None
+    between = np.arange(excited[0], excited[-1])
+    free = between[~np.isin(between, excited)]
+    if not free.size:
+        return None
+    scale = 1e4 / float(power[excited].mean())
+
+    def percent(values: F64) -> float:
+        return math.sqrt(scale * float(values.mean())) if values.size else math.nan
+
+    even = free[free % 2 == 0]
+    odd = free[free % 2 == 1]
+    return FreeLines(percent(power[even]), percent(power[odd]), percent(variance[free]))
+
+
+def _averaged(sent: F64, answered: F64, size: int, rate_hz: float) -> _Lines:
+    """Return the response from averaged cross-spectra (Welch, H1) of segments of a size."""
+    if size < 2 * _FEWEST_LINES:
+        raise DataError(f"only {sent.size} samples: record a longer run")
+    settings: Mapping[str, Any] = {"fs": rate_hz, "nperseg": size}
+    hz, own = signal.welch(sent, **settings)
+    cross, coherence = (f(sent, answered, **settings)[1] for f in (signal.csd, signal.coherence))
+    excited = own > _WEAK * own[1:].max()
+    excited[:2] = False  # the mean leaks into the first line
+    hz, own, cross, coherence = (each[excited] for each in (hz, own, cross, coherence))
+    averages = (sent.size - size // 2) // (size - size // 2)
+    coherence = np.clip(coherence, 1e-12, 1.0)
+    relative = np.sqrt((1.0 - coherence) / (2.0 * coherence * averages / _OVERLAP))
+    response = cross / own
+    noise = relative * np.abs(response)
+    return _Lines(hz, response, noise, coherence, 0.5 * float(np.ptp(sent)), averages)
+
+
+def _sines(recording: Recording, segments: list[Segment], columns: _Columns) -> _Lines:
+    """Return one line per sine, from its steady cycles."""
+    found = []
+    for segment in segments:
+        samples, cycles = steady_samples(recording, segment)
+        since = samples.index - segment.start
+        values = [samples.column(name) for name in columns]
+        if cycles >= _FEWEST_PERIODS:
+            x, y = (each_cycle(since, segment.period, each, cycles)[:, 1:2] for each in values)
+            found.append((segment, cycles, values[0], _scattered(x, y)))
+    if len(found) < _FEWEST_LINES:
+        rule = f"only {len(found)} sines have {_FEWEST_PERIODS} steady cycles"
+        raise DataError(f"{recording.path}: {rule}, fewer than {_FEWEST_LINES}: make them longer")
+    response, noise, coherence = (np.concatenate([line[k] for *_, line in found]) for k in range(3))
+    return _Lines(
+        np.array([recording.sample_rate_hz / segment.period for segment, *_ in found]),
+        response,
+        noise,
+        coherence,
+        max(0.5 * float(np.ptp(sent)) for _, _, sent, _ in found),
+        min(cycles for _, cycles, *_ in found),
+    )
+
+
+def each_cycle(since: I64, period: float, values: F64, cycles: int) -> C128:
+    """Return coefficients 0 to 2 of each whole cycle without drift: complex128[cycles, 3].
+
+    ``since`` is the sample number since the start of the segment.
+    """
+    good = np.isfinite(values)
+    since, values = since[good], values[good]
+    number = np.floor((since - since[-1] - 0.5) / period).astype(np.int64) + cycles
+    rows = [row for k in range(cycles) if (row := number == k).any()]
+    if len(rows) > 1:  # a line through the samples would remove part of the sine
+        means = [float(values[row].mean()) for row in rows]
+        slope = np.polynomial.polynomial.polyfit(np.arange(len(rows)), means, 1)[1]
+        values = values - slope * since / period
+    return np.array([coefficients(since[r], period, values[r], 2) for r in rows])
+
+
+def _response(x: F64, frequency_hz: F64) -> C128:
+    """Return the response of gain, delay, lag and, with 5 parameters, a resonance."""
+    s = 2j * np.pi * frequency_hz
+    answer: C128 = np.exp(x[0] - s * x[1]) / (1.0 + s * x[2])
+    if x.size > 3:
+        part = 1j * frequency_hz / np.exp(x[3])
+        answer = answer / (1.0 + 2.0 * np.exp(x[4]) * part + part**2)
+    return answer
+
+
+def _fit(hz: F64, response: C128, noise: F64, rate_hz: float, *, held: bool) -> dict[str, Any]:
+    """Return the fields of a fit; ``held`` if the output follows a command held for a sample."""
+    sign = math.copysign(1.0, response[0].real)
+    turns = hz / rate_hz
+    half = np.exp(-1j * np.pi * turns) if held else np.ones(hz.size, complex)
+    # What is slower than the samples smooths the steps; what is faster ends each within a sample.
+    holds = [half, half * np.sinc(turns)] if held else [half]
+    fits = [
+        (hold, _chosen(hz, sign * response / hold, noise / np.abs(hold), rate_hz)) for hold in holds
+    ]
+    hold, found = min(fits, key=lambda each: float(each[1].cost))
+    fitted = sign * hold * _response(found.x, hz)
+    gain, lag_s = math.exp(found.x[0]), float(found.x[2])
+    mode = [*map(math.exp, found.x[3:])]
+    curve_hz = np.geomspace(hz[0], hz[-1], _CURVE_POINTS)
+    below = np.flatnonzero(np.abs(_response(found.x, curve_hz)) < gain * math.sqrt(0.5))
+    scales = dict(zip(_FITTED, (gain, 1.0, 1.0, *mode), strict=False))
+    return {
+        "gain_um": sign * gain,
+        "delay_s": float(found.x[1]),
+        "lag_s": lag_s if lag_s * hz[-1] > 1e-3 else 0.0,
+        "natural_hz": mode[0] if mode else None,
+        "damping_ratio": mode[1] if mode else None,
+        "bandwidth_hz": float(curve_hz[below[0]]) if below.size else None,
+        "errors": dict(zip(scales, (_errors(found) * [*scales.values()]).tolist(), strict=True)),
+        "misfit_percent": 100.0 * float(np.sqrt(np.mean(np.abs(fitted - response) ** 2))) / gain,
+        "fitted": fitted,
+    }
+
+
+def _chosen(hz: F64, response: C128, noise: F64, rate_hz: float) -> OptimizeResult:
+    """Return the fit, with a resonance in the band if that explains half of the misfit."""
+    plain = _best(hz, response, noise, rate_hz, [None])
+    resonant = _best(hz, response, noise, rate_hz, [*np.geomspace(2.0 * hz[0], hz[-1], 6)])
+    natural_hz, damping = np.exp(resonant.x[3:])
+    worth = resonant.cost < _WORTH * plain.cost and damping < _MOST_DAMPING
+    return resonant if worth and natural_hz < hz[-1] else plain
+
+
+def _errors(found: OptimizeResult) -> F64:
+    """Return the standard errors of the parameters from the Jacobian and the residuals."""
+    rows, count = found.jac.shape
+    variance = 2.0 * float(found.cost) / max(rows - count, 1)
+    covariance = np.linalg.pinv(found.jac.T @ found.jac, hermitian=True)
+    errors: F64 = np.sqrt(np.maximum(variance * np.diag(covariance), 0.0))
+    return errors
+
+
+def _best(
+    hz: F64, response: C128, noise: F64, rate_hz: float, tries: list[float] | list[None]
+) -> OptimizeResult:
+    """Return the best fit from several starting frequencies; None fits no resonance."""
+    doubt = np.hypot(noise, _HYSTERESIS * np.abs(response))
+    top = float(hz[-1])
+    slope = np.polynomial.polynomial.polyfit(hz, np.unwrap(np.angle(response)), 1)[1]
+    delay_s = min(max(-slope / (2.0 * np.pi), 0.5 / rate_hz), 100.0 / rate_hz)
+
+    def residuals(x: F64) -> F64:
+        off = (_response(x, hz) - response) / doubt
+        return np.concatenate((off.real, off.imag))
+
+    def fitted(start_hz: float | None) -> OptimizeResult:
+        start = [math.log(abs(response[0])), 0.5 * delay_s, 0.02 / top]
+        low, high = [-30.0, -1.0 / rate_hz, 0.0], [30.0, 1e4 / rate_hz, 1e3 / top]
+        if start_hz is not None:
+            start += [math.log(start_hz), math.log(0.1)]
+            low += [math.log(0.5 * hz[0]), math.log(1e-4)]
+            high += [math.log(1.5 * top), math.log(5.0)]
+        return least_squares(residuals, start, bounds=(low, high), loss="soft_l1", x_scale="jac")
+
+    return min((fitted(each) for each in tries), key=lambda each: float(each.cost))
