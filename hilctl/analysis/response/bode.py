@@ -47,6 +47,9 @@ def response_sheet(
     panels = tuple(Panel(partial(draw, part=part), height=height) for part, height in _PARTS)
     over = "; ".join(dict.fromkeys(signals_text(each) for each in responses))
     caption = f"Frequency response, {over}: measured (dots) and fitted (lines)."
+    if len(responses) == 1 and (mode := responses[0].structure) is not None:
+        damping = significant(mode.damping_ratio)
+        caption += f" Resonance {quantity(mode.natural_hz, 'Hz')}, damping ratio {damping}."
     return FigureSpec("response", caption, panels, stacked=True)
 
 
@@ -110,6 +113,9 @@ def fit_rows(found: FrequencyResponse) -> Iterator[tuple[str, str]]:
         yield "natural frequency", measured("natural_hz", "Hz")
         yield "damping ratio", measured("damping_ratio")
         yield "quality factor", quantity(found.quality)
+    for mode in found.further:
+        at = f"{quantity(mode.natural_hz, 'Hz', 4)}, damping ratio {quantity(mode.damping_ratio)}"
+        yield "further mode", f"{at}; antiresonance {quantity(mode.antiresonance_hz, 'Hz', 4)}"
     bandwidth = f"above {quantity(float(found.frequency_hz[-1]), 'Hz')}"
     if found.bandwidth_hz is not None:
         bandwidth = quantity(found.bandwidth_hz, "Hz", 4)

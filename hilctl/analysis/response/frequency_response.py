@@ -10,7 +10,7 @@ of averaged spectra.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
@@ -26,7 +26,7 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import C128, F64, I64
 from hilctl.identify.data.data_files import without_gaps
 from hilctl.ilc.cycle import coefficients
-from hilctl.models.linear_stages import FirstMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.recording.recording import Recording
 
 Signals: TypeAlias = Literal["command-displacement", "reference-displacement", "command-measured"]
@@ -44,6 +44,11 @@ _USABLE = 0.3  # largest relative noise of a line
 _HYSTERESIS = 0.03  # of a line, that no linear response explains
 _WORTH = 0.5  # of the misfit that a resonance must explain
 _MOST_DAMPING = 0.8
+_MOST_FURTHER = 2  # modes beside the first
+_WORTH_FURTHER = 0.25
+_MOST_FURTHER_DAMPING = 0.3
+_PAIR = 4  # parameters of a further mode
+_TRIES = 6  # starting frequencies of a mode
 _CURVE_POINTS = 2000
 _FITTED = ("gain_um", "delay_s", "lag_s", "natural_hz", "damping_ratio")
 
@@ -88,6 +93,7 @@ class FrequencyResponse:
         lag_s: Time constant of a first-order lag; 0 for none.
         natural_hz: Natural frequency; None without a resonance.
         damping_ratio: Its damping ratio; None without a resonance.
+        further: Further modes, with their antiresonances.
         bandwidth_hz: -3 dB bandwidth; None if it is above the measured frequencies.
         errors: Standard errors of the fit, by the names of these fields.
         misfit_percent: rms residual of the fit, of the gain.
@@ -112,6 +118,7 @@ class FrequencyResponse:
     lag_s: float
     natural_hz: float | None
     damping_ratio: float | None
+    further: tuple[FurtherMode, ...]
     bandwidth_hz: float | None
     errors: Mapping[str, float]
     misfit_percent: float
@@ -146,11 +153,14 @@ class FrequencyResponse:
 
     def to_scipy(self) -> signal.TransferFunction:
         """Return the fit without its delay as a continuous transfer function."""
-        poles = np.array([self.lag_s, 1.0]) if self.lag_s else np.ones(1)
-        if (mode := self.structure) is not None:
-            omega = 2.0 * math.pi * mode.natural_hz
-            poles = np.polymul(poles, [omega**-2, 2.0 * mode.damping_ratio / omega, 1.0])
-        return signal.TransferFunction([self.gain_um], poles)
+        zeros, poles = np.array([self.gain_um]), np.array([self.lag_s, 1.0])
+        if (first := self.structure) is not None:
+            poles = np.polymul(poles, _polynomial(first.natural_hz, first.damping_ratio))
+        for mode in self.further:
+            poles = np.polymul(poles, _polynomial(mode.natural_hz, mode.damping_ratio))
+            antiresonance = mode.antiresonance_hz, mode.antiresonance_damping_ratio
+            zeros = np.polymul(zeros, _polynomial(*antiresonance))
+        return signal.TransferFunction(zeros, poles)  # removes a leading zero
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, as ``hilctl frf --json`` prints them."""
@@ -169,8 +179,15 @@ class FrequencyResponse:
             "quality": self.quality,
             "errors": dict(self.errors),
             "free": self.free and asdict(self.free),
+            "further": [each.model_dump() for each in self.further],
             **{name: values.tolist() for name, values in arrays.items()},
         }
+
+
+def _polynomial(natural_hz: float, damping_ratio: float) -> F64:
+    """Return the coefficients of a second-order factor, the highest power first."""
+    omega = 2.0 * math.pi * natural_hz
+    return np.array([omega**-2, 2.0 * damping_ratio / omega, 1.0])
 
 
 class _Lines(NamedTuple):
@@ -402,13 +419,22 @@ def each_cycle(since: I64, period: float, values: F64, cycles: int) -> C128:
 
 
 def _response(x: F64, frequency_hz: F64) -> C128:
-    """Return the response of gain, delay, lag and, with 5 parameters, a resonance."""
+    """Return the response of gain, delay, lag, and in ``x[3:]`` any modes: complex128[k].
+
+    The first mode has two parameters, each further one two and two for its antiresonance.
+    """
     s = 2j * np.pi * frequency_hz
     answer: C128 = np.exp(x[0] - s * x[1]) / (1.0 + s * x[2])
-    if x.size > 3:
-        part = 1j * frequency_hz / np.exp(x[3])
-        answer = answer / (1.0 + 2.0 * np.exp(x[4]) * part + part**2)
+    for k in (3, *range(5, x.size, _PAIR)) if x.size > 3 else ():
+        answer /= _quadratic(frequency_hz, x[k], x[k + 1])
+    for k in range(5, x.size, _PAIR):
+        answer *= _quadratic(frequency_hz, x[k] + x[k + 2], x[k + 3])
     return answer
+
+
+def _quadratic(frequency_hz: F64, log_hz: float, log_damping: float) -> C128:
+    part = 1j * frequency_hz / math.exp(log_hz)
+    return np.asarray(1.0 + 2.0 * math.exp(log_damping) * part + part**2)
 
 
 def _fit(hz: F64, response: C128, noise: F64, rate_hz: float, *, held: bool) -> dict[str, Any]:
@@ -424,7 +450,7 @@ def _fit(hz: F64, response: C128, noise: F64, rate_hz: float, *, held: bool) -> 
     hold, found = min(fits, key=lambda each: float(each[1].cost))
     fitted = sign * hold * _response(found.x, hz)
     gain, lag_s = math.exp(found.x[0]), float(found.x[2])
-    mode = [*map(math.exp, found.x[3:])]
+    mode = [*map(math.exp, found.x[3:5])]
     curve_hz = np.geomspace(hz[0], hz[-1], _CURVE_POINTS)
     below = np.flatnonzero(np.abs(_response(found.x, curve_hz)) < gain * math.sqrt(0.5))
     scales = dict(zip(_FITTED, (gain, 1.0, 1.0, *mode), strict=False))
@@ -434,20 +460,50 @@ def _fit(hz: F64, response: C128, noise: F64, rate_hz: float, *, held: bool) -> 
         "lag_s": lag_s if lag_s * hz[-1] > 1e-3 else 0.0,
         "natural_hz": mode[0] if mode else None,
         "damping_ratio": mode[1] if mode else None,
+        "further": tuple(
+            FurtherMode(
+                natural_hz=natural_hz,
+                damping_ratio=damping,
+                antiresonance_hz=natural_hz * ratio,
+                antiresonance_damping_ratio=other,
+            )
+            for natural_hz, damping, ratio, other in np.exp(found.x[5:]).reshape(-1, _PAIR).tolist()
+        ),
         "bandwidth_hz": float(curve_hz[below[0]]) if below.size else None,
-        "errors": dict(zip(scales, (_errors(found) * [*scales.values()]).tolist(), strict=True)),
+        "errors": dict(
+            zip(scales, (_errors(found)[: len(scales)] * [*scales.values()]).tolist(), strict=True)
+        ),
         "misfit_percent": 100.0 * float(np.sqrt(np.mean(np.abs(fitted - response) ** 2))) / gain,
         "fitted": fitted,
     }
 
 
 def _chosen(hz: F64, response: C128, noise: F64, rate_hz: float) -> OptimizeResult:
-    """Return the fit, with a resonance in the band if that explains half of the misfit."""
-    plain = _best(hz, response, noise, rate_hz, [None])
-    resonant = _best(hz, response, noise, rate_hz, [*np.geomspace(2.0 * hz[0], hz[-1], 6)])
-    natural_hz, damping = np.exp(resonant.x[3:])
-    worth = resonant.cost < _WORTH * plain.cost and damping < _MOST_DAMPING
-    return resonant if worth and natural_hz < hz[-1] else plain
+    """Return the fit, with as many modes in the band as explain most of the misfit each."""
+    slope = np.polynomial.polynomial.polyfit(hz, np.unwrap(np.angle(response)), 1)[1]
+    delay_s = min(max(-slope / (2.0 * np.pi), 0.5 / rate_hz), 100.0 / rate_hz)
+    start = [math.log(abs(response[0])), 0.5 * delay_s, 0.02 / hz[-1]]
+    found = _best(hz, response, noise, rate_hz, [start])
+    further = math.log(0.05), 0.0, math.log(0.05)
+    for added, worth, most_damping in (
+        ((math.log(0.1),), _WORTH, _MOST_DAMPING),
+        *[(further, _WORTH_FURTHER, _MOST_FURTHER_DAMPING)] * _MOST_FURTHER,
+    ):
+        if hz.size <= len(start) + len(added):  # two numbers per line: twice as many as parameters
+            break
+        worst_hz = hz[np.argmax(np.abs(response / _response(np.array(start), hz) - 1.0))]
+        tries = worst_hz, *np.geomspace(2.0 * hz[0], hz[-1], _TRIES).tolist()
+        starts = [[*start, math.log(each), *added] for each in tries]
+        more = _best(hz, response, noise, rate_hz, starts)
+        natural_hz, damping = np.exp(more.x[len(start) : len(start) + 2])
+        plausible = natural_hz < hz[-1] and damping < most_damping
+        plausible &= math.exp(more.x[4]) < _MOST_DAMPING
+        start = more.x.tolist()
+        if plausible and more.cost < worth * found.cost:
+            found = more
+        elif found.x.size > 3:
+            break  # otherwise two modes may explain what one alone does not
+    return found
 
 
 def _errors(found: OptimizeResult) -> F64:
@@ -460,25 +516,23 @@ def _errors(found: OptimizeResult) -> F64:
 
 
 def _best(
-    hz: F64, response: C128, noise: F64, rate_hz: float, tries: list[float] | list[None]
+    hz: F64, response: C128, noise: F64, rate_hz: float, starts: Sequence[Sequence[float]]
 ) -> OptimizeResult:
-    """Return the best fit from several starting frequencies; None fits no resonance."""
+    """Return the best fit from several starts with the same number of parameters."""
     doubt = np.hypot(noise, _HYSTERESIS * np.abs(response))
-    top = float(hz[-1])
-    slope = np.polynomial.polynomial.polyfit(hz, np.unwrap(np.angle(response)), 1)[1]
-    delay_s = min(max(-slope / (2.0 * np.pi), 0.5 / rate_hz), 100.0 / rate_hz)
+    first, last = math.log(0.5 * hz[0]), math.log(1.5 * hz[-1])
+    low = [-30.0, -1.0 / rate_hz, 0.0, first, math.log(1e-4)]
+    high = [30.0, 1e4 / rate_hz, 1e3 / hz[-1], last, math.log(5.0)]
+    low += [first, math.log(1e-4), -math.log(2.0), math.log(1e-4)] * _MOST_FURTHER
+    high += [last, 0.0, math.log(2.0), 0.0] * _MOST_FURTHER
+    bounds = low[: len(starts[0])], high[: len(starts[0])]
 
     def residuals(x: F64) -> F64:
         off = (_response(x, hz) - response) / doubt
         return np.concatenate((off.real, off.imag))
 
-    def fitted(start_hz: float | None) -> OptimizeResult:
-        start = [math.log(abs(response[0])), 0.5 * delay_s, 0.02 / top]
-        low, high = [-30.0, -1.0 / rate_hz, 0.0], [30.0, 1e4 / rate_hz, 1e3 / top]
-        if start_hz is not None:
-            start += [math.log(start_hz), math.log(0.1)]
-            low += [math.log(0.5 * hz[0]), math.log(1e-4)]
-            high += [math.log(1.5 * top), math.log(5.0)]
-        return least_squares(residuals, start, bounds=(low, high), loss="soft_l1", x_scale="jac")
-
-    return min((fitted(each) for each in tries), key=lambda each: float(each.cost))
+    fits = (
+        least_squares(residuals, start, bounds=bounds, loss="soft_l1", x_scale="jac")
+        for start in starts
+    )
+    return min(fits, key=lambda each: float(each.cost))

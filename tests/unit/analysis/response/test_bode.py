@@ -31,6 +31,7 @@ SMALL = FrequencyResponse(
     lag_s=5e-4,
     natural_hz=700.0,
     damping_ratio=0.1,
+    further=(),
     bandwidth_hz=None,
     errors={"gain_um": 0.01, "delay_s": 1e-6, "lag_s": 1e-6, "natural_hz": 1.0},
     misfit_percent=1.0,
