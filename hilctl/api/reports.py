@@ -20,7 +20,7 @@ from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.run_page import run_sheets, write_html
 from hilctl.api._types import PathLike, Paths, paths_of
 from hilctl.api.recordings import RecordedRun, read, stream_of
-from hilctl.base.errors import InputError
+from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable
 from hilctl.models.model_file import load_model
 from hilctl.run.control.client import finish_dead_runs
@@ -85,10 +85,19 @@ def frf(
     """
     if html is not None:
         check_writable(Path(html), overwrite=overwrite)
-    found = tuple(frequency_response(read(each).recording, signals) for each in paths_of(runs))
+    found, problems = [], []
+    for run in paths_of(runs):
+        try:
+            found.append(frequency_response(read(run).recording, signals))
+        except (InputError, DataError) as error:
+            problems.append(error)
+    if len(problems) > 1:
+        raise InputError("\n".join(map(str, problems)))
+    if problems:
+        raise problems[0]
     if html is not None:
         write_responses(found, Path(html))
-    return found
+    return tuple(found)
 
 
 def report_runs(
