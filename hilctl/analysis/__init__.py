@@ -13,6 +13,7 @@ PUBLIC = (
     "run_metrics",
     "response.bode",
     "response.frequency_response",
+    "response.step_response",
     "run_page",
     "steady_state",
 )

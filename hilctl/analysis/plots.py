@@ -25,9 +25,9 @@ from hilctl.analysis.plot_style import (
 from hilctl.analysis.quantiles import Quantiles
 from hilctl.analysis.response.bode import response_sheet
 from hilctl.analysis.response.frequency_response import frequency_response
+from hilctl.analysis.response.step_response import step_response as measured_step
 from hilctl.analysis.steady_state import (
     SteadyPart,
-    loop_signals,
     steady_part,
     steady_samples,
     trusted,
@@ -50,7 +50,6 @@ _DECADES = 5.0  # of amplitude that a spectrum shows
 _LOW = 0.5
 _LARGEST_UM = 1e100  # larger readings have no spectrum
 _WIDEST_GAP = 0.02  # share of samples that may be missing
-_SETTLED = 0.05  # of a step
 
 
 @dataclass(frozen=True, slots=True)
@@ -183,26 +182,22 @@ def step_response(recording: Recording, focus: int = 0) -> FigureSpec | None:
     if focus >= len(recording.segments) or recording.segments[focus].kind != "step":
         return None
     segment = recording.segments[focus]
-    samples = trusted(recording.samples.part(segment.start, segment.stop))
-    wanted, moved_um = loop_signals(samples, compensated=recording.compensated)
-    moves = np.flatnonzero(np.diff(wanted))
-    if not moves.size or not np.isfinite(moved_um).all():
+    try:
+        found = measured_step(recording, segment=segment)
+    except DataError:
         return None
-    starts = moves[np.diff(moves, prepend=-2) > 1]
-    stops = moves[np.diff(moves, append=wanted.size) > 1] + 1
-    largest = int(np.argmax(np.abs(wanted[stops] - wanted[starts])))
-    start, stop = int(starts[largest]), int(np.append(starts, wanted.size)[largest + 1])
-    after_um = moved_um[start:stop]
-    end_um = float(after_um[-max(1, after_um.size // 10) :].mean())
-    off = np.abs(after_um - end_um) > _SETTLED * abs(end_um - after_um[0])
-    settled = int(np.append(np.flatnonzero(off), 0).max()) + 1
-    rate_hz = recording.sample_rate_hz
-    caption = (
-        f"Largest step: within {100.0 * _SETTLED:g} % of its end after "
-        f"{quantity(settled / rate_hz, 's')}."
+    caption = "Largest step; the noise exceeds the band for its settling time."
+    start = round(found.start_s * recording.sample_rate_hz)
+    stop = start + round(found.dwell_s * recording.sample_rate_hz)
+    settled = stop - start
+    if found.settling_s is not None:
+        after = quantity(found.settling_s, "s")
+        caption = f"Largest step: within {found.band_percent:g} % of its end after {after}."
+        settled = round(found.settling_s * recording.sample_rate_hz)
+    shown = trusted(recording.samples).part(
+        max(segment.start, start - settled // 4), min(stop, start + 4 * settled)
     )
-    shown = samples.rows(slice(max(0, start - settled // 4), min(stop, start + 4 * settled)))
-    return _detail("step_response", caption, recording, shown, int(samples.index[start]))
+    return _detail("step_response", caption, recording, shown, start)
 
 
 def _zoom(recording: Recording, focus: int) -> Samples | None:

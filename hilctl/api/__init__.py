@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from hilctl.api.connection import RunConnection, connect
     from hilctl.api.models import LoadedModel, compare, export_model, identify, load_model, refine
     from hilctl.api.recordings import RecordedRun, export, list_runs, read, summarize
-    from hilctl.api.reports import figures, frf, replay, report_page, report_runs
+    from hilctl.api.reports import figures, frf, replay, report_page, report_runs, step
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
     from hilctl.api.tables import RunTable, SampleTable
 
@@ -78,6 +78,7 @@ __all__ = [
     "report_page",
     "report_runs",
     "run",
+    "step",
     "summarize",
 ]
 
@@ -105,7 +106,7 @@ if not TYPE_CHECKING:
             "load_model",
             "refine",
         },
-        "reports": {"figures", "frf", "replay", "report_page", "report_runs"},
+        "reports": {"figures", "frf", "replay", "report_page", "report_runs", "step"},
         "runs": {"WrittenExperiment", "check", "init", "load", "run"},
         "tables": {"RunTable", "SampleTable"},
     }

@@ -16,6 +16,8 @@ from hilctl.analysis.response.frequency_response import (
     Signals,
     frequency_response,
 )
+from hilctl.analysis.response.step_response import SETTLED_PERCENT, StepResponse
+from hilctl.analysis.response.step_response import step_response as measured_step
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.run_page import run_sheets, write_html
 from hilctl.api._types import PathLike, Paths, paths_of
@@ -98,6 +100,21 @@ def frf(
     if html is not None:
         write_responses(found, Path(html))
     return tuple(found)
+
+
+def step(run: RecordedRun | PathLike, *, band_percent: float = SETTLED_PERCENT) -> StepResponse:
+    """Return the response to the largest step of a run's last step segment.
+
+    Args:
+        run: Recording in memory, or a file.
+        band_percent: Band for the settling time, in percent of the step's height.
+
+    Raises:
+        InputError: The file does not exist.
+        DataError: The file is not a recording, or has no step with a displacement.
+    """
+    recorded = run if isinstance(run, RecordedRun) else read(run)
+    return measured_step(recorded.recording, band_percent)
 
 
 def report_runs(

@@ -1,4 +1,4 @@
-"""Commands that measure an actuator: characterise, frf."""
+"""Commands that measure an actuator: characterise, frf, step."""
 
 import shlex
 import signal
@@ -12,9 +12,10 @@ from rich.console import Group
 from hilctl import api
 from hilctl.analysis.response.bode import fit_rows, line_table
 from hilctl.analysis.response.frequency_response import FrequencyResponse, Signals
+from hilctl.analysis.response.step_response import SETTLED_PERCENT, StepResponse
 from hilctl.api._types import runs_folder
 from hilctl.base.errors import RunError
-from hilctl.base.formatting import printable
+from hilctl.base.formatting import printable, quantity
 from hilctl.cli.console import listing, print_rich, progress_bar, table
 from hilctl.cli.options import (
     AsJson,
@@ -23,6 +24,7 @@ from hilctl.cli.options import (
     Fast,
     LabelTexts,
     Overwrite,
+    RecordingFile,
     Settings,
     recording_paths,
 )
@@ -199,7 +201,36 @@ def frf(
     print_result(values, lambda: print_rich(*map(render_response, found)), as_json=as_json)
 
 
+def step(
+    recording: RecordingFile,
+    band_percent: Annotated[
+        float, typer.Option(min=0.0, help="Band for the settling time, % of the height.")
+    ] = SETTLED_PERCENT,
+    as_json: AsJson = False,
+) -> None:
+    """Measure the response to the largest step: rise, settling, overshoot, ringing."""
+    found = api.step(recording, band_percent=band_percent)
+    print_result(found.to_mapping(), lambda: print_rich(render_step(found)), as_json=as_json)
+
+
+def render_step(found: StepResponse) -> Group:
+    """Return the metrics of a step."""
+    settling = "unknown: the noise exceeds the band. Use a larger step or --band-percent."
+    if found.settling_s is not None:
+        settling = quantity(found.settling_s, "s")
+    rows = [
+        ("step at", quantity(found.start_s, "s", 4)),
+        ("height", quantity(found.height_um, "um", 4)),
+        ("rise, 10 to 90 %", quantity(found.rise_s, "s")),
+        (f"settling to {found.band_percent:g} %", settling),
+        ("overshoot", quantity(found.overshoot_percent, "%")),
+        ("natural frequency", quantity(found.natural_hz, "Hz", 4)),
+        ("damping ratio", quantity(found.damping_ratio)),
+    ]
+    return Group(printable(str(found.path)), listing("", rows))
+
+
 def render_response(found: FrequencyResponse) -> Group:
     """Return the fit and a table of a frequency response."""
     lines = table("", *line_table(found))
-    return Group(listing(printable(str(found.path)), fit_rows(found)), lines)
+    return Group(printable(str(found.path)), listing("", fit_rows(found)), lines)

@@ -71,6 +71,7 @@ _MODULES = {
         "characterise": "Measure a connected actuator within its limits, "
         "then identify and validate a model.",
         "frf": "Measure the frequency response of runs: gain, phase, coherence, resonance.",
+        "step": "Measure the response to the largest step: rise, settling, overshoot, ringing.",
     },
     "hilctl.cli.campaigns": {
         "campaign": "Run an experiment with each combination of varied keys "

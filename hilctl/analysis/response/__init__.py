@@ -1,1 +1,1 @@
-"""Frequency response: measurement and fit, Bode plot and page."""
+"""Frequency and step responses: measurement and fit, Bode plot and page."""

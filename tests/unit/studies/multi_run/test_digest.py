@@ -162,33 +162,3 @@ def test_a_damaged_experiment_takes_only_its_settings_away(make_recording):
     found = digest.digest_of(recording)
     assert found.values == {}
     assert found.figures.peak_to_peak_um == pytest.approx(80.0, rel=1e-3)
-
-
-T = np.arange(10_000) / RATE_HZ
-
-
-def answer(natural_hz, damping, creep_um=1.0, noise_um=0.0):
-    omega = 2.0 * np.pi * natural_hz
-    damped = omega * np.sqrt(1.0 - damping**2)
-    ring = np.exp(-damping * omega * T) * np.cos(damped * T + 0.4)
-    noise = noise_um * np.random.default_rng(4).standard_normal(T.size)
-    return 7.0 - 3.0 * ring - creep_um * np.exp(-T / 2e-3) + noise
-
-
-@pytest.mark.slow
-@pytest.mark.parametrize("natural_hz", [100.0, 300.0, 2300.0])
-@pytest.mark.parametrize("damping", [0.02, 0.12, 0.4])
-def test_frequency_and_damping_are_found(natural_hz, damping):
-    found = digest.ringing(answer(natural_hz, damping, 4.0, 0.036), RATE_HZ)
-    assert found.natural_hz == pytest.approx(natural_hz, rel=0.03)
-    assert found.damping_ratio == pytest.approx(damping, rel=0.1)
-    assert found.misfit_um < 0.1
-
-
-def test_where_nothing_rings_there_is_none():
-    creep = 7.0 - 3.0 * np.exp(-T / 2e-3)
-    noise = 0.036 * np.random.default_rng(4).standard_normal(T.size)
-    assert digest.ringing(creep + noise, RATE_HZ) is None
-    assert digest.ringing(noise, RATE_HZ) is None
-    assert digest.ringing(np.zeros(1000), RATE_HZ) is None
-    assert digest.ringing(np.ones(10), RATE_HZ) is None
