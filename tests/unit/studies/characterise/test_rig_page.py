@@ -1,11 +1,14 @@
 """Page and figures of a characterisation."""
 
+import html
 from dataclasses import replace
 
 import numpy as np
 import pytest
 
 from hilctl.analysis.figure_layout import drawn
+from hilctl.identify.evaluation import StrokeError
+from hilctl.identify.model_quality import Verdict
 from hilctl.models.linear_stages import FurtherMode
 from hilctl.models.staged import StagedModel
 from hilctl.studies.characterise import rig_page
@@ -60,9 +63,12 @@ WHOLE = replace(
 
 @pytest.mark.slow
 def test_the_held_out_error_comes_first():
-    page = rig_page.characterisation_page(replace(WHOLE, identification=identification()))
+    classes = (StrokeError("full stroke", 1.5, 0.4, 3),)
+    verdict = Verdict("good", 1.5, held_out=True, notes=("a note",), classes=classes)
+    known = replace(identification(), verdict=verdict)
+    page = rig_page.characterisation_page(replace(WHOLE, identification=known))
     assert page.index("Validation errors") < page.index("<h2>Measured")
-    assert "Verdict: good: within 1.50 %" in page
+    assert f"Verdict: {html.escape(str(verdict))}" in page
     assert "a note" in page
     assert "http://" not in page
     assert page.count("<figcaption") == page.count("<svg") > 5
