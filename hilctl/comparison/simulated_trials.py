@@ -141,7 +141,7 @@ def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[Inve
         cycle = cycle_metrics.fold(np.arange(start, stop) - segment.start, segment.period, signals)
         wanted, moved = cycle.signals
         peak, rms = cycle_metrics.peak_and_rms_percent(
-            moved - wanted, cycle_metrics.peak_to_peak(moved)
+            moved - wanted, cycle_metrics.peak_to_peak(wanted)
         )
         trials.append(
             InverseTrial(

@@ -6,7 +6,7 @@ import math
 import numpy as np
 import pytest
 
-from hilctl.base.samples import Flag, Samples
+from hilctl.base.samples import COLUMNS, Flag, Samples
 from tests.benchmark import other_reader
 from tests.benchmark.attacked import RAMP_A_PER_S, START_A, DeviceLog
 from tests.benchmark.kills import STAYS, Attack
@@ -30,8 +30,8 @@ def ramp(start_a, period_s=PERIOD_S):
 
 
 def samples(commands, unanswered=0):
-    values = np.zeros((6, len(commands)))
-    values[2] = commands
+    values = np.zeros((len(COLUMNS), len(commands)))
+    values[list(COLUMNS).index("command")] = commands
     flags = np.zeros(len(commands), dtype=np.uint32)
     flags[len(commands) - unanswered :] = Flag.UNANSWERED
     return Samples.of(np.arange(len(commands)), values, flags)

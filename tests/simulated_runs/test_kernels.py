@@ -73,7 +73,7 @@ settings = [f"waveform.{name}={value}" for name, value in times.items()]
 path = Path(sys.argv[2])
 unpaced.run_unpaced(checked_experiment(Path(sys.argv[1]), settings), path)
 columns = read(path).samples.columns()
-np.save(path.with_suffix(".npy"), np.array(list(columns.values())))
+np.save(path.with_suffix(".npy"), np.array([each for each in columns.values() if each.size]))
 """
 
 

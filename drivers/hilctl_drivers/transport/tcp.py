@@ -21,7 +21,8 @@ _RECEIVED, _MOST_CHUNKS = 65536, 64
 _SO_TIMESTAMPNS = 35
 """Option of Linux that Python does not name: the kernel's time of arrival with the data."""
 _TIMESPEC = struct.Struct("@ll")
-_NOTE_SIZE = socket.CMSG_SPACE(_TIMESPEC.size)
+_NOTE_SIZE = 64
+"""Room for that time, with its header."""
 
 
 def _connected(address: tuple[str, int], timeout_s: float) -> socket.socket:
