@@ -1,7 +1,7 @@
 """Results of a characterisation: measurements, model, and validation."""
 
 from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any
 
@@ -22,7 +22,7 @@ from hilctl.identify.pipeline import (
     settings_from,
     with_verdict,
 )
-from hilctl.models.base import HysteresisModel
+from hilctl.models.base import STROKES, HysteresisModel
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
@@ -165,6 +165,7 @@ def _is_signal(value: Any) -> bool:
 
 
 _SLACK = 0.01
+_NOISE_PEAK = 3.0  # times its rms: the largest noise in a motion
 
 FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "settled-loops", "training")
 """Steps for identification. Each starts with a motion of full amplitude, which erases the earlier
@@ -236,7 +237,13 @@ def validated(
         more = stroke_errors(reference.motions(stroke_um) for reference in references)
         classes = largest_errors((*known.classes, *more))
         within = max(each.peak_percent for each in classes)
-        verdict = Verdict(grade_of(classes), within, True, notes=known.notes, classes=classes)
+        # The grade is that of the model: the sensor's noise is left out of it.
+        noise_percent = 100.0 * _NOISE_PEAK * noise_um / stroke_um
+        models = [
+            replace(each, peak_percent=each.peak_percent - noise_percent / STROKES[each.label])
+            for each in classes
+        ]
+        verdict = Verdict(grade_of(models), within, True, notes=known.notes, classes=classes)
     return with_verdict(found, verdict), references
 
 
