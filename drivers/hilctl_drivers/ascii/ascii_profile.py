@@ -18,7 +18,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from functools import cache
 from string import Formatter
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias, get_args
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias, cast, get_args
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
@@ -52,7 +52,7 @@ def binary_format(spec: str) -> RegisterFormat | None:
         ValueError: The byte order does not fit the type.
     """
     found = _BINARY.fullmatch(spec)
-    return RegisterFormat(found[1], found[2] or "") if found else None  # type: ignore[arg-type]
+    return RegisterFormat(cast("RegisterType", found[1]), found[2] or "") if found else None
 
 
 @dataclass(frozen=True, slots=True)
