@@ -251,10 +251,11 @@ class BaseProfile(StrictModel):
 
     @model_validator(mode="after")
     def _says_what_is_unverified(self) -> Self:
-        if (self.verified == "partly") != bool(self.unverified) and self.verified != "no":
-            raise ValueError(
-                "verified must be 'partly' when keys are unverified, and name them then"
-            )
+        if self.verified == "yes" and self.unverified:
+            raise ValueError("verified must be partly or no if unverified lists keys, got yes")
+        if self.verified == "partly" and not self.unverified:
+            rule = "verified must be yes or no, or unverified must list the unconfirmed keys"
+            raise ValueError(f"{rule}, got partly without a list")
         return self
 
     @model_validator(mode="after")

@@ -13,6 +13,7 @@ A frame is written as its bytes in hexadecimal, such as ``A0 34 13 83 11 55``. T
 order are those of :mod:`hilctl_drivers.modbus.register_map`. The example shows a reply's length.
 """
 
+import math
 import re
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
@@ -274,7 +275,9 @@ class ScaledRange(Range):
 class AsciiOutput(ScaledRange):
     """An output set by a line of text or a frame; value = number * scale + offset."""
 
-    write: LineTemplate = Field(description="sets it; {value} is (value - offset) / scale")
+    write: LineTemplate = Field(
+        description="sets it; {value:.4f} is (value - offset) / scale with 4 decimals"
+    )
     reply: Reply | Literal["none"] = Field(
         description="form of a good reply; none if there is none"
     )
@@ -284,8 +287,7 @@ class AsciiOutput(ScaledRange):
 
     @model_validator(mode="after")
     def _has_value(self) -> Self:
-        if "value" not in fields_of(self.write):
-            raise ValueError("write must have the field {value}")
+        self.check_write("write", self.write)
         for limit in self.limits:
             try:
                 fill(self.write, **SAMPLES | {"value": self.number(limit)})
@@ -293,6 +295,26 @@ class AsciiOutput(ScaledRange):
                 value = f"{limit:g} {self.unit} with scale {self.scale:g}"
                 raise ValueError(f"min and max must fit write, got {value}: {error}") from None
         return self
+
+    def check_write(self, key: str, template: str) -> None:
+        """Raise ValueError if a template has no value, or rounds it by more than a step.
+
+        The text is made after the limiter: a coarse format would exceed the limits of a run.
+        """
+        specs = [spec or "" for _, name, spec, _ in Formatter().parse(template) if name == "value"]
+        if not specs:
+            raise ValueError(f"{key} must have the field {{value}}")
+        for spec in specs:
+            for part in range(8) if binary_format(spec) is None else ():
+                # Sevenths have no short decimal.
+                number = self.number(self.min + (self.max - self.min) * part / 7.0)
+                sent = format(number, spec)
+                if abs((float(sent) - number) * self.scale) > self.step:
+                    rule = f"{key} must have the digits of {self.step:g} {self.unit}"
+                    why = "the resolution, or a thousandth of the range"
+                    places = max(0, math.ceil(-math.log10(self.step / abs(self.scale))))
+                    hint = f"use for example {{value:.{places}f}}"
+                    raise ValueError(f"{rule} ({why}), got {sent!r} for {number:g}: {hint}")
 
 
 class AsciiInput(ScaledRange, Query, MeasuredReply):
@@ -453,8 +475,7 @@ class AsciiProfile(BaseProfile):
             return self
         if self.exchange.output not in self.outputs or self.exchange.input not in self.inputs:
             raise ValueError("exchange.output and exchange.input must be an output and an input")
-        if "value" not in fields_of(self.exchange.write):
-            raise ValueError("exchange.write must have the field {value}")
+        self.outputs[self.exchange.output].check_write("exchange.write", self.exchange.write)
         if "\n" in self.exchange.write and self.link.silence_s:
             raise ValueError(
                 "exchange.write must be one line if min_gap_s separates commands, got "
