@@ -133,15 +133,16 @@ class DacDevice(ABC):
         Returns:
             Displacement in um, and the output in the command's unit; None if it cannot be known.
         """
+        action = "read the sensor and the output"
         if self._block:
-            raise self._error("look", "open")
+            raise self._error(action, "open")
         try:
             displacement_um, output = self._look()
             if self._curve is not None:
                 displacement_um = float(np.interp(displacement_um, *self._curve))
             return displacement_um, output
         except DeviceError as error:
-            raise self._error("look", str(error)) from None
+            raise self._error(action, str(error)) from None
         finally:
             self._release()
 

@@ -326,7 +326,7 @@ def _voltage_problems(
             cure = f"lower the frequency, {smaller}"
     place, _ = _place(loaded, reference, forecast, at_s)
     hint = f"{excess_v:.3g} V too much{place}: {cure}, or use an amplifier of {_up(needed_v):g} V"
-    rule = f"the run must need no more than {amplifier.voltage_max_v:g} V"
+    rule = f"the voltage of the run must be <= {amplifier.voltage_max_v:g} V"
     yield loaded.problem("amplifier.voltage_max_v", rule, f"{needed_v:.4g} V", hint)
 
 

@@ -195,6 +195,8 @@ def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
         return did_you_mean(str(detail["loc"][-1]), known)
     if kind in _WORDS:  # the rule lists all of them
         given, words = detail.get("ctx", {}).get("tag", value), _QUOTED.findall(_expected(detail))
+        if given in words:  # written as Python does, so with an escape
+            return f'write it in double quotes: "{given}"'
         return did_you_mean(str(given), words, listed=True) if len(words) > 1 else ""
     if kind in _NUMBER_TYPES and isinstance(value, str):
         return _number_hint(value)

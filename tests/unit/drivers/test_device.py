@@ -130,7 +130,7 @@ def test_looking_is_for_a_device_that_is_closed():
     device = NotingDac()
     assert device.look() == (1.0, None)
     device.broken = "look"
-    with pytest.raises(DeviceError, match=r"dac at /dev/x: no answer \(to look\)"):
+    with pytest.raises(DeviceError, match=r"dac at /dev/x: no answer \(to read the"):
         device.look()
     assert device.calls == ["look", "release"] * 2
     device.open(1000.0, 1)

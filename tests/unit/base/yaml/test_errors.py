@@ -25,6 +25,7 @@ class Guard(StrictModel):
 class Several(StrictModel):
     guard: Guard | Literal["none"] = "none"
     base: Literal[0, 1, "modicon"] | None = None
+    end: Literal["\r", "\n"] = "\n"
     level: float | Literal["safe"] = 0.0
     guards: Mapping[str, Guard | Literal["none"]] = Field(default_factory=dict)
     span: tuple[float, Annotated[int, Field(ge=0)]] = (0.0, 0)
@@ -45,6 +46,8 @@ class Several(StrictModel):
      ["x:1: guard.kick: must be one of 'any' or 'write', got 'x'"]),
     ("guard: {timeout_s: 2, kick: wirte}",
      ["x:1: guard.kick: must be one of 'any' or 'write', got 'wirte' (did you mean 'write'?)"]),
+    (r"end: '\n'",
+     [r"x:1: end: must be one of '\r' or '\n', got '\\n'" r' (write it in double quotes: "\n")']),
     ("base: 2", ["x:1: base: must be one of 0, 1 or 'modicon', got 2"]),
     ("level: high", ["x:1: level: must be a number, or 'safe', got 'high'"]),
     ("level: '1e3'", ["x:1: level: must be a number, or 'safe', got '1e3' (remove the quotes)"]),
