@@ -4,6 +4,7 @@ This module imports neither numba nor SciPy, so that ``status`` and ``stop`` sta
 """
 
 from collections.abc import Sequence
+from pathlib import Path
 from typing import Annotated, Any
 
 import typer
@@ -131,7 +132,9 @@ def print_stopped(stopped: Sequence[dict[str, Any]], wait_s: float) -> None:
         print("no active run")
     for run in stopped:
         if run["ended"]:
-            print(f"{run['name']} stopped; recording: {run['recording']}")
+            recorded = Path(run["recording"]).exists()  # not if it had not started yet
+            kept = f"recording: {run['recording']}" if recorded else "no recording"
+            print(f"{run['name']} stopped; {kept}")
         else:
             reason = run["error"] or "stop requested"
             print(f"{run['name']} is still active after {wait_s:g} s: {reason}")

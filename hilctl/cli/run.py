@@ -233,8 +233,11 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
 
 def render_report(report: RunReport) -> Group:
     """Return the tables of a report; the segments have their own if there are several."""
-    quality, rows, (headings, cells) = quality_rows(report), run_rows(report), segment_table(report)
-    parts = [_two_columns(printable(report.name) or "run", quality), _two_columns("", rows)]
+    rows, (headings, cells) = run_rows(report), segment_table(report)
+    title = printable(report.name) or "run"
+    parts = [_two_columns(title, rows)]
+    if quality := quality_rows(report):
+        parts = [_two_columns(title, quality), _two_columns("", rows)]
     if len(cells) > 1:
         shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
         cells = [[row[i] for i in shown] for row in cells]

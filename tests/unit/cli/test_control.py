@@ -1,5 +1,6 @@
 """Commands on active runs: exit codes, JSON and printed lines."""
 
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -119,11 +120,15 @@ def test_change_is_one_line(capsys, inverse, said):
     assert capsys.readouterr().out == f"sine-7: gain 0.5, offset -2{said}, over 1.5 s\n"
 
 
-def test_stop_prints_one_line_per_run(capsys):
+def test_stop_prints_one_line_per_run(capsys, tmp_path, monkeypatch):
+    monkeypatch.chdir(tmp_path)
+    Path("a.mcap").touch()
     runs = [stopped("a", ended=True), stopped("b", ended=False)]
     print_stopped([*runs, stopped("c", ended=False, error="no right")], 2.0)
+    print_stopped([stopped("d", ended=True)], 2.0)
     print_stopped([], 2.0)
     lines = capsys.readouterr().out.splitlines()
     assert lines[0] == "a stopped; recording: a.mcap"
-    assert [line.partition(" ")[0] for line in lines] == ["a", "b", "c", "no"]
+    assert [line.partition(" ")[0] for line in lines] == ["a", "b", "c", "d", "no"]
+    assert lines[3] == "d stopped; no recording"
     assert lines[2].endswith("no right")
