@@ -233,8 +233,8 @@ def check_no_input(path: Path, inputs: Iterable[Path]) -> None:
 
 
 REMEDIES = {
-    errno.EACCES: "use a place of your own, or ask its owner (ls -l)",
-    errno.EPERM: "use a place of your own, or ask its owner (ls -l)",
+    errno.EACCES: "use another path, or ask the owner of this one (ls -l)",
+    errno.EPERM: "use another path, or ask the owner of this one (ls -l)",
     errno.EROFS: "use another file system",
     errno.ENOSPC: "df -h lists free space",
     errno.EDQUOT: "delete files, or use another file system",
