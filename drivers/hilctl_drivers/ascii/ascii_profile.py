@@ -309,7 +309,11 @@ class AsciiOutput(ScaledRange):
                 # Sevenths have no short decimal.
                 number = self.number(self.min + (self.max - self.min) * part / 7.0)
                 sent = format(number, spec)
-                if abs((float(sent) - number) * self.scale) > self.step:
+                try:
+                    coarse = abs((float(sent) - number) * self.scale) > self.step
+                except ValueError:  # such as 45.7%
+                    coarse = True
+                if coarse:
                     rule = f"{key} must have the digits of {self.step:g} {self.unit}"
                     why = "the resolution, or a thousandth of the range"
                     places = max(0, math.ceil(-math.log10(self.step / abs(self.scale))))

@@ -171,6 +171,7 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("ascii", {"outputs.OUT.write": "SET {volts}"}, "fields must be of {value}, {safe}, {address}"),
     ("ascii", {"outputs.OUT.write": "SET {value.real}"}, "fields must be of {value}, {safe}"),
     ("ascii", {"outputs.OUT.write": "SET {value:.0f}"}, "outputs.OUT: write must have the digits"),
+    ("ascii", {"outputs.OUT.write": "SET {value:%}"}, "outputs.OUT: write must have the digits"),
     ("ascii", {"outputs.OUT.write": "SET {value"}, "outputs.OUT.write: "),
     ("ascii", {"outputs.OUT.write": "SET {value:d}"}, "outputs.OUT.write: "),
     ("ascii", {"outputs.OUT.write": "SET\t{value}"}, "must be printable ASCII"),
