@@ -49,7 +49,6 @@ _log = logging.getLogger(__name__)
 _MANY = 50_000_000  # samples, which take some seconds
 _ROUNDING = 1e-9  # of the range of commands
 _MORE_SLOPE = 1.5  # of a loop at its ends, than on average
-_RANGE_SLACK = 0.002  # of the range that a model was identified on
 _SOFT_SHARE = 0.25  # of the slew limit, for a soft start
 _SLOWER = "lower frequency or amplitude, soften jumps (soft_start_s, soft_end_s, rise_s)"
 
@@ -242,15 +241,18 @@ def reference_problems(
     """Return the ranges that a reference from ``low`` to ``high``, in ``unit``, leaves."""
     if unit != "um":
         return []
-    spans = [("limits.stroke_um", loaded.config.limits.stroke_um, 0.0)]
-    if loaded.model is not None and (known := loaded.model.output_range_um) is not None:
-        # A drive of one sign rests at an end of the range, by the model within its error.
+    config, model = loaded.config, loaded.model
+    spans = [("limits.stroke_um", config.limits.stroke_um)]
+    if model is not None and model.output_range_um is not None:
+        # A run begins at rest, which a drive of one sign leaves for good with its first rise.
+        rests_um = rests_at(model, config.sample_rate_hz, config.safe.value)
+        ends_um = *model.output_range_um, rests_um
         name = "the range that compensator.model was identified on"
-        spans.append((name, known, _RANGE_SLACK * (known[1] - known[0])))
+        spans.append((name, (min(ends_um), max(ends_um))))
     found = []
-    for name, (lowest, highest), slack_um in spans:
+    for name, (lowest, highest) in spans:
         excess = max(lowest - low, high - highest)
-        if excess > slack_um:
+        if excess > 0.0:
             rule = f"reference must stay within {name}, {lowest:g} to {highest:g} µm"
             value = f"{low:.6g} to {high:.6g} µm"
             hint = f"{excess:.3g} µm too far: {_fitting(low, high, lowest, highest)}"

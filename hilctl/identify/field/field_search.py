@@ -126,7 +126,7 @@ FIRST_LAGS = (0.02, 0.1, 0.4)  # lags of the field of the starts
 NEAR_BOUND = 0.95
 STIFFER = (0.02, 0.05)  # radians of further starts, if the first ends at a bound
 LEAST_WIDEST = 0.1  # minimum of the largest threshold, of half the span
-TAIL = 0.02  # of all weights: those beyond the largest useful threshold
+TAIL = 0.002  # of all weights: those beyond the largest useful threshold
 
 
 @dataclass(frozen=True, slots=True)

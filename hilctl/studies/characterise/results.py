@@ -203,14 +203,12 @@ def _history(recording: Recording) -> History:
     """Return a recording up to the end of its last waveform, with gaps filled.
 
     Until the first waveform has been at both of its ends, the displacement depends on what the
-    actuator did before, so that part is not evaluated. A drive of one sign erases nothing: its
-    whole history is evaluated, from the state that the model assumes at rest.
+    actuator did before, so that part is not evaluated.
     """
     stop = recording.segments[-1].steady_stop
     command, displacement_um = without_gaps(recording, 0, stop)
     begin = command[: recording.segments[0].stop]
-    lowest, highest = int(begin.argmin()), int(begin.argmax())
-    erased = max(lowest, highest) if begin[lowest] < begin[0] < begin[highest] else 0
+    erased = max(int(begin.argmin()), int(begin.argmax()))
     held = np.setdiff1d(np.arange(stop), recording.samples.index)
     label, rate_hz = recording.path.name, recording.sample_rate_hz
     return History(label, command, displacement_um, rate_hz, erased, held)

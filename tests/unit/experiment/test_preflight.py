@@ -147,9 +147,10 @@ class TestReference:
         assert found.hint.startswith(hint)
         checked(DISPLACEMENT, *settings, "waveform.amplitude=9.5", model=model)
 
-    def test_the_range_of_a_model_has_its_error(self):
-        model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 9.99)})
-        checked(DISPLACEMENT, "waveform.soft_start_s=0.0", model=model)
+    def test_a_run_may_begin_at_rest_outside_the_range_of_a_model(self):
+        model = terfenol_rdpi().model_copy(update={"output_range_um": (2.0, 12.0)})
+        rising = ("waveform.amplitude=2.0", "waveform.offset=5.0", "waveform.soft_start_s=0.1")
+        checked(DISPLACEMENT, *rising, model=model)
 
     def test_outside_both(self):
         model = terfenol_rdpi().model_copy(update={"output_range_um": (-12.0, 12.0)})
