@@ -52,7 +52,9 @@ def characterise(
     ] = None,
     fast: Fast = False,
     dry_run: DryRun = False,
-    overwrite: Overwrite = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the model and all recordings of FOLDER.")
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Measure a connected actuator within its limits, then identify and validate a model."""

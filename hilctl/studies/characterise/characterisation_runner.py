@@ -172,7 +172,8 @@ class CharacterisationRunner:
         """Run all steps, then identify and validate the model and write it to ``output``.
 
         Raises:
-            InputError: A file can't be written, or no disk space; nothing has moved.
+            InputError: A file can't be written, no disk space, or the folder has recordings with
+                other settings; nothing has moved.
             StepStoppedError: The user stopped a step.
             RunError: A step ended by a fault that is no known problem of the rig.
         """
@@ -242,16 +243,28 @@ class CharacterisationRunner:
         return read(path)
 
     def _kept(self, path: Path, settings: list[str]) -> Recording | None:
-        """Return the recording of a step that is done; otherwise None."""
+        """Return the recording of a step that is done; otherwise None.
+
+        Raises:
+            InputError: It was recorded with other settings, not as a consequence of an earlier
+                step that was run again.
+        """
         if not path.exists():
             return None
         try:
             recording = read(path)
         except DataError:  # truncated before its first sample
             return None
-        key = RunKey.of(load_experiment(self._experiment, settings))
-        same = RunKey.of_facts(recording.run) == key
-        return recording if same and recording.end.get("code") == "completed" else None
+        if recording.end.get("code") != "completed":
+            return None
+        if RunKey.of_facts(recording.run) == RunKey.of(load_experiment(self._experiment, settings)):
+            return recording
+        if all(row.kept for row in self._rows):
+            raise InputError(
+                f"{path} was recorded with other settings: restore them, choose another --folder, "
+                "or replace all recordings with --overwrite"
+            )
+        return None
 
     def _pause_s(self, heat: RunHeat) -> float:
         """Return the time to cool after the steps so far and the device's last run."""
