@@ -7,7 +7,7 @@ Manual" 7.5. SCPI: SCPI-1999 volume 1, 7.2.1 for numbers; number forms as in IEE
 import math
 import re
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
 from typing import ClassVar, Literal, TypeAlias
@@ -36,7 +36,7 @@ from hilctl_drivers.dac_setup import DacSetup, SensorReader
 from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.crc import CRCS, Bytes, Crc, dcon_checksum, gen_checksum
-from hilctl_drivers.transport.framing import DelimitedSplitter
+from hilctl_drivers.transport.framing import split_at
 from hilctl_drivers.transport.links import (
     BadRequestError,
     CorruptError,
@@ -99,9 +99,9 @@ class LineFormat:
             raise CorruptError(f"must be one line that ends in {self.terminator!r}, got {data!r}")
         return self._text(data[:end])
 
-    def splitter(self) -> DelimitedSplitter[str]:
-        """Return a splitter at the beginning of a stream of lines."""
-        return DelimitedSplitter(self._text, self.terminator, self.size_max, skip_empty=False)
+    def messages(self, received: bytearray) -> Iterator[str]:
+        """Remove the complete lines from a stream; yield the texts of the good ones."""
+        return split_at(received, self.terminator, self._text)
 
     def size(self, text: str) -> int:
         """Return the bytes of a text of one or more lines on the wire."""

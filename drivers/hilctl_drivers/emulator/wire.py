@@ -17,7 +17,7 @@ from hilctl_drivers.ascii.ascii_profile import (
 from hilctl_drivers.ascii.ascii_session import FrameFormat, formats, parse_number
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
 from hilctl_drivers.transport.crc import Bytes
-from hilctl_drivers.transport.framing import PrefixedSplitter, Splitter, binary_framing
+from hilctl_drivers.transport.framing import binary_framing, split_sized
 from hilctl_drivers.transport.links import CorruptError
 
 _NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
@@ -125,14 +125,14 @@ def _field(spec: str) -> tuple[str, Callable[[str], float]]:
     return _NUMBER, float
 
 
-def _frame_splitter(form: FrameFormat, profile: AsciiProfile) -> PrefixedSplitter:
-    """Return a splitter of a profile's requests, the longest first; it yields their texts."""
+def _frame_size(form: FrameFormat, profile: AsciiProfile) -> Callable[[Bytes], int]:
+    """Return a function of received bytes: the size of the request that they begin with."""
     lines = [line for _, text in profile.requests() for line in text.split("\n")]
     known = [TemplateMatcher(line, profile.unit) for line in lines]
     known.sort(key=lambda each: -each.size)
 
-    def size_at(data: Bytes, at: int) -> int:
-        text = as_text(bytes(data[at:]))
+    def size_of(data: Bytes) -> int:
+        text = as_text(bytes(data))
         for each in known:
             if each.match(text[: each.size]) is not None:
                 return (each.size + 1) // 3 + form.check.size
@@ -140,7 +140,7 @@ def _frame_splitter(form: FrameFormat, profile: AsciiProfile) -> PrefixedSplitte
             raise CorruptError("no request begins here")
         return 0
 
-    return PrefixedSplitter(size_at, lambda frame: form.decode(frame).encode())
+    return size_of
 
 
 class EmulatedLine:
@@ -148,21 +148,22 @@ class EmulatedLine:
 
     def __init__(self, profile: SerialProfile, devices: Sequence[SerialDevice]) -> None:
         self.devices = devices
-        self._splitter: Splitter[str] | Splitter[bytes]
+        self._received = bytearray()
+        self._messages: Callable[[bytearray], Iterator[str] | Iterator[bytes]]
         self._encode: Callable[[bytes], bytes]
         link = profile.link
         self._is_text = not isinstance(link, FramesLink)
         if isinstance(link, FramesLink):
             framing = binary_framing(link.framing, link.crc, link.payload_max)
-            self._splitter, self._encode = framing.splitter(), framing.encode
+            self._messages, self._encode = framing.messages, framing.encode
         else:
             assert isinstance(profile, AsciiProfile)
             requests, replies = formats(link)
-            self._splitter = (
-                _frame_splitter(requests, profile)
-                if isinstance(requests, FrameFormat)
-                else requests.splitter()
-            )
+            if isinstance(requests, FrameFormat):
+                size_of, decode = _frame_size(requests, profile), requests.decode
+                self._messages = lambda received: split_sized(received, size_of, decode)
+            else:
+                self._messages = requests.messages
             self._encode = lambda message: replies.encode(message.decode())
 
     def tick(self, now_ns: int) -> None:
@@ -171,11 +172,11 @@ class EmulatedLine:
             device.tick(now_ns)
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Yield the good messages; the splitter keeps an incomplete one."""
-        data = bytes(received)
+        """Yield the good messages; an incomplete one is kept, however long it takes."""
+        self._received += received
         received.clear()
-        for each in self._splitter.feed(data):
-            if each and not isinstance(each, CorruptError):
+        for each in self._messages(self._received):
+            if each:
                 yield each.encode() if isinstance(each, str) else each
 
     def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:

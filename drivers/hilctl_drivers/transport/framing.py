@@ -1,16 +1,17 @@
-"""Binary frames, and splitters that find messages in a stream.
+"""Binary frames, and functions that find messages in a stream.
 
 COBS frame: ``COBS(payload | crc LE) 00``. Length-prefixed frame: ``length u16 LE | payload | crc
 LE``, the length counting the payload alone, the CRC over length and payload. COBS: Cheshire and
 Baker, "Consistent Overhead Byte Stuffing", IEEE/ACM Transactions on Networking 7(2), 1999.
 
-Splitters find the next message again after damaged bytes.
+In a stream the next message is found again after damaged bytes.
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from contextlib import suppress
 from dataclasses import dataclass
-from typing import Generic, Literal, TypeAlias, TypeVar
+from typing import Literal, TypeAlias, TypeVar
 
 from cobs import cobs
 
@@ -20,105 +21,44 @@ from hilctl_drivers.transport.links import BadRequestError, CorruptError, Incomp
 Content = TypeVar("Content")
 
 
-class Splitter(ABC, Generic[Content]):
-    """Splits a stream into messages and resynchronises after damaged bytes."""
+def split_at(
+    received: bytearray, end: bytes, parse: Callable[[Bytes], Content]
+) -> Iterator[Content]:
+    """Remove the messages up to the last ``end`` from a stream; yield the good ones.
 
-    def __init__(self) -> None:
-        self._buffer = bytearray()
-        self._lost = False
-
-    @abstractmethod
-    def feed(self, chunk: Bytes) -> list[Content | CorruptError]:
-        """Take received bytes and return the contents that they complete, in order.
-
-        A lost part of the stream is one :class:`CorruptError` in its place, not raised.
-        """
-
-    def reset(self) -> None:
-        """Forget the received bytes, as after a timeout."""
-        self._buffer.clear()
-        self._lost = False
+    ``parse`` converts a message without its end, or raises CorruptError.
+    """
+    *parts, rest = received.split(end)
+    received[:] = rest
+    for part in parts:
+        with suppress(CorruptError):
+            yield parse(part)
 
 
-class DelimitedSplitter(Splitter[Content]):
-    """A :class:`Splitter` for messages that end in bytes which occur nowhere else in them.
+def split_sized(
+    received: bytearray, size_of: Callable[[Bytes], int], parse: Callable[[bytes], Content]
+) -> Iterator[Content]:
+    """Remove the frames from a stream, each with a known size; yield the good ones.
+
+    After a bad frame every byte is tried as a beginning until a frame's check passes.
 
     Args:
-        parse: Converts a message without its end, or raises CorruptError.
-        end: The bytes that end a message.
-        size_max: Most bytes of a good message without its end; bounds the buffer.
-        skip_empty: Whether to ignore empty messages.
+        received: The stream; an incomplete frame stays in it.
+        size_of: Returns the size of the first frame, 0 if it is not known yet, or raises
+            CorruptError.
+        parse: Converts a frame, or raises CorruptError.
     """
-
-    def __init__(
-        self, parse: Callable[[Bytes], Content], end: bytes, size_max: int, *, skip_empty: bool
-    ) -> None:
-        super().__init__()
-        self._parse = parse
-        self._end = end
-        self._size_max = size_max
-        self._skip_empty = skip_empty
-
-    def feed(self, chunk: Bytes) -> list[Content | CorruptError]:
-        """See :meth:`Splitter.feed`."""
-        out: list[Content | CorruptError] = []
-        self._buffer += chunk
-        *parts, self._buffer = self._buffer.split(self._end)
-        for part in parts:
-            if self._lost:
-                self._lost = False
-            elif part or not self._skip_empty:
-                try:
-                    out.append(self._parse(part))
-                except CorruptError as error:
-                    out.append(error)
-        if len(self._buffer) > self._size_max + len(self._end):
-            if not self._lost:
-                out.append(CorruptError(f"no end within {self._size_max} bytes"))
-            self._lost = True
-            # The first bytes of an end may already be here.
-            del self._buffer[: -len(self._end)]
-        return out
-
-
-class PrefixedSplitter(Splitter[bytes]):
-    """A :class:`Splitter` for frames that begin with their length.
-
-    After a bad frame it tries every byte as a beginning until a frame's check passes.
-
-    Args:
-        size_at: Returns the size of the frame at a position of the buffer, 0 if it is not known
-            yet, or raises CorruptError.
-        parse: Returns the payload of a frame, or raises CorruptError.
-    """
-
-    def __init__(
-        self, size_at: Callable[[Bytes, int], int], parse: Callable[[bytes], bytes]
-    ) -> None:
-        super().__init__()
-        self._size_at = size_at
-        self._parse = parse
-
-    def feed(self, chunk: Bytes) -> list[bytes | CorruptError]:
-        """See :meth:`Splitter.feed`."""
-        out: list[bytes | CorruptError] = []
-        self._buffer += chunk
-        at = 0
-        while True:
-            try:
-                size = self._size_at(self._buffer, at)
-                if not size or len(self._buffer) - at < size:
-                    break
-                out.append(self._parse(bytes(self._buffer[at : at + size])))
-                self._lost = False
-                at += size
-            except CorruptError as error:
-                if not self._lost:
-                    out.append(error)
-                self._lost = True
-                at += 1
-        del self._buffer[:at]
-        return out
+    while True:
+        try:
+            size = size_of(received)
+            if not size or len(received) < size:
+                return
+            content = parse(bytes(received[:size]))
+        except CorruptError:
+            del received[0]
+        else:
+            del received[:size]
+            yield content
 
 
 FramingKind: TypeAlias = Literal["cobs", "length"]
@@ -159,8 +99,8 @@ class Framing(ABC):
         """Return the most bytes that a payload of this size takes on the wire."""
 
     @abstractmethod
-    def splitter(self) -> Splitter[bytes]:
-        """Return a splitter at the beginning of a stream."""
+    def messages(self, received: bytearray) -> Iterator[bytes]:
+        """Remove the complete frames from a stream; yield the payloads of the good ones."""
 
     @abstractmethod
     def _frame(self, payload: bytes) -> bytes:
@@ -201,10 +141,9 @@ class CobsFraming(Framing):
         body: int = cobs.max_encoded_length(payload_size + self.crc.size)
         return body + 1
 
-    def splitter(self) -> Splitter[bytes]:
-        """See :meth:`Framing.splitter`."""
-        size_max = self.wire_size(self.payload_max) - 1
-        return DelimitedSplitter(self._payload, b"\0", size_max, skip_empty=True)
+    def messages(self, received: bytearray) -> Iterator[bytes]:
+        """See :meth:`Framing.messages`."""
+        return split_at(received, b"\0", self._payload)
 
     def _payload(self, body: Bytes) -> bytes:
         try:
@@ -222,7 +161,7 @@ class LengthFraming(Framing):
     """Length-prefixed frames, see the module; they need a CRC to find the next beginning.
 
     A wrong length makes a stream wait for up to ``payload_max`` bytes. Set that no higher than the
-    protocol needs, and reset the splitter after a timeout.
+    protocol needs.
     """
 
     def __post_init__(self) -> None:
@@ -237,7 +176,7 @@ class LengthFraming(Framing):
 
     def decode(self, frame: Bytes) -> bytes:
         """See :meth:`Framing.decode`."""
-        size = self._size_at(frame, 0)
+        size = self._size_of(frame)
         if not size or len(frame) < size:
             raise IncompleteError(f"{len(frame)} bytes of a frame")
         if len(frame) > size:
@@ -248,15 +187,15 @@ class LengthFraming(Framing):
         """See :meth:`Framing.wire_size`."""
         return LENGTH_SIZE + payload_size + self.crc.size
 
-    def splitter(self) -> Splitter[bytes]:
-        """See :meth:`Framing.splitter`."""
-        return PrefixedSplitter(self._size_at, self._payload)
+    def messages(self, received: bytearray) -> Iterator[bytes]:
+        """See :meth:`Framing.messages`."""
+        return split_sized(received, self._size_of, self._payload)
 
-    def _size_at(self, data: Bytes, at: int) -> int:
-        """Return the size of the frame that begins at ``at``, 0 if it is not known yet."""
-        if len(data) - at < LENGTH_SIZE:
+    def _size_of(self, data: Bytes) -> int:
+        """Return the size of the frame at the beginning, 0 if it is not known yet."""
+        if len(data) < LENGTH_SIZE:
             return 0
-        size = data[at] | data[at + 1] << 8
+        size = data[0] | data[1] << 8
         self._check_size(size)
         return self.wire_size(size)
 

@@ -292,15 +292,11 @@ def test_wrong_or_missing_checksums_are_corrupt(line, wire):
         line.decode(wire)
 
 
-def test_stream_of_lines_finds_an_end_cut_in_two_by_noise():
-    """The first byte of an end that came with too much noise is not thrown away with it."""
-    splitter = LineFormat(b"\r\n", size_max=20).splitter()
-    assert len(splitter.feed(b"x" * 30 + b"\r")) == 1
-    assert splitter.feed(b"\ngood\r\n") == ["good"]
-
-
-def test_stream_of_lines_passes_on_empty_lines():
-    assert PLAIN_LINE.splitter().feed(b"\rOK\r\r") == ["", "OK", ""]
+def test_stream_of_lines_skips_bad_ones_and_passes_on_empty_ones():
+    """A line that is too long is bad; the incomplete last one stays."""
+    received = bytearray(b"x" * 30 + b"\r\ngood\r\n\r\nincomplete\r")
+    assert list(LineFormat(b"\r\n", size_max=20).messages(received)) == ["good", ""]
+    assert received == b"incomplete\r"
 
 
 @pytest.mark.parametrize(("reply", "value"), [

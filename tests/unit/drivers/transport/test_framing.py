@@ -1,16 +1,12 @@
 """Binary frames: bytes as specified, exact limits, and streams that find their way back."""
 
-import itertools
 import random
 
 import pytest
-from hypothesis import given
-from hypothesis import strategies as st
 
 from hilctl_drivers.transport.crc import CRCS
 from hilctl_drivers.transport.framing import (
     CobsFraming,
-    DelimitedSplitter,
     LengthFraming,
     binary_framing,
 )
@@ -31,9 +27,14 @@ EACH = pytest.mark.parametrize(
 COBS, LENGTH = CobsFraming(CRCS["crc16_modbus"]), LengthFraming(CRCS["crc16_modbus"])
 
 
-def payloads_of(split):
-    """Return what a splitter made of a stream, with lost stretches as None."""
-    return [None if isinstance(each, CorruptError) else each for each in split]
+def split(framing, *parts):
+    """Return the payloads in a stream that comes in parts."""
+    received = bytearray()
+    found = []
+    for part in parts:
+        received += part
+        found += framing.messages(received)
+    return found
 
 
 @pytest.mark.parametrize(("payload", "wire"), [
@@ -94,9 +95,6 @@ def test_cobs_size_on_the_wire_is_the_largest_there_is():
         framing.decode(b"\x01" * 9)
     with pytest.raises(CorruptError, match=r"within 10 bytes"):
         framing.decode(b"\x01" * 10)
-    splitter = framing.splitter()
-    assert splitter.feed(b"\x01" * 10) == []
-    assert [str(each) for each in splitter.feed(b"\x01")] == ["no end within 9 bytes"]
 
 
 @pytest.mark.parametrize(("framing", "frame", "text"), [
@@ -156,87 +154,28 @@ def test_limits_hold_for_what_is_received():
 def test_zeros_are_no_frame():
     """A CRC that starts at 0 would pass a line stuck at zero, if empty payloads were allowed."""
     framing = LengthFraming(CRCS["crc16_xmodem"])
-    assert payloads_of(framing.splitter().feed(bytes(100))) == [None]
-
-
-def test_cobs_stream_drops_what_never_ends():
-    """What never ends is reported once and kept short; after the next 00 all is well."""
-    framing = CobsFraming(CRCS["crc32"], payload_max=16)
-    splitter = framing.splitter()
-    out = list(itertools.chain.from_iterable(splitter.feed(b"\x01" * 10) for _ in range(100)))
-    assert payloads_of(out) == [None]
-    assert "no end within" in str(out[0])
-    assert len(splitter._buffer) < 32
-    good = framing.encode(b"good")
-    assert splitter.feed(b"\x01\x00" + good) == [b"good"]
+    assert split(framing, bytes(100)) == []
 
 
 @ALL
 def test_stream_takes_the_largest_frame_byte_by_byte(framing):
     framing = type(framing)(framing.crc, payload_max=40)
     for payload in (b"\xff" * 40, bytes(40)):
-        splitter = framing.splitter()
-        out = [each for byte in framing.encode(payload) for each in splitter.feed(bytes((byte,)))]
-        assert out == [payload]
+        assert split(framing, *(bytes((byte,)) for byte in framing.encode(payload))) == [payload]
 
 
 @EACH
-def test_stream_reports_each_lost_stretch(framing):
+def test_stream_loses_damaged_frames_only(framing):
     framing = type(framing)(framing.crc, payload_max=8)
-    good, bad = framing.encode(b"\x01\x02\x03"), bytearray(framing.encode(b"\x01\x02\x03"))
+    frames = [framing.encode(bytes([each, 2, 3])) for each in range(4)]
+    bad = bytearray(frames[0])
     bad[3] ^= 0x40
-    out = payloads_of(framing.splitter().feed(good + bad + good + good + bad + good))
-    assert out == [b"\1\2\3", None, b"\1\2\3", b"\1\2\3", None, b"\1\2\3"]
+    out = split(framing, frames[0] + bad + frames[1] + frames[2] + bad + frames[3])
+    assert [each[0] for each in out] == [0, 1, 2, 3]
 
 
 def test_cobs_stream_ignores_00_in_a_row():
     """Senders may put 00 in front of frames to wake a receiver up."""
     framing = CobsFraming(CRCS["crc16_modbus"])
     stream = b"\0\0\0" + framing.encode(b"a") + b"\0" + framing.encode(b"b")
-    assert framing.splitter().feed(stream) == [b"a", b"b"]
-
-
-@EACH
-def test_reset_forgets_that_the_way_was_lost(framing):
-    framing = type(framing)(framing.crc, payload_max=16)
-    rubbish = b"\xff" * 64
-    splitter = framing.splitter()
-    for _ in range(2):
-        assert payloads_of(splitter.feed(rubbish)) == [None]
-        splitter.reset()
-    good = framing.encode(b"good")
-    assert splitter.feed(good[:-2]) == []
-    splitter.reset()
-    assert splitter.feed(good) == [b"good"]
-
-
-def text(part):
-    if b"x" in part:
-        raise CorruptError("an x")
-    return bytes(part)
-
-
-def lines(*, skip_empty=False):
-    return DelimitedSplitter(text, b"\r\n", 8, skip_empty=skip_empty)
-
-
-def said(found):
-    return [str(each) if isinstance(each, CorruptError) else each for each in found]
-
-
-@given(st.lists(st.integers(1, 5)))
-def test_any_cut_gives_the_same_messages(sizes):
-    data, split = b"ab\r\ncd\r\n\r\ne\r\n", lines()
-    found, at = [], 0
-    for size in [*sizes, len(data)]:
-        found += split.feed(data[at : at + size])
-        at += size
-    assert found == [b"ab", b"cd", b"", b"e"]
-
-
-def test_empty_messages_can_be_left_out():
-    assert lines(skip_empty=True).feed(b"\r\n\r\na\r\n") == [b"a"]
-
-
-def test_one_bad_message_costs_no_other():
-    assert said(lines().feed(b"a\r\nx\r\nb\r\n")) == [b"a", "an x", b"b"]
+    assert split(framing, stream) == [b"a", b"b"]
