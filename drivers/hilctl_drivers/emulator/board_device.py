@@ -10,8 +10,8 @@ from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.board_profile import FrameProfile, FrameStreaming
 from hilctl_drivers.board.board_session import BoardValues
 from hilctl_drivers.board.frames import Status
-from hilctl_drivers.emulator.rig import Bench, EmulatedDevice, SampleFifo
-from hilctl_drivers.emulator.wire import EmulatedReply
+from hilctl_drivers.emulator.rig import Bench, SampleFifo
+from hilctl_drivers.emulator.wire import EmulatedReply, SerialDevice
 
 _GOOD = b"\0"
 
@@ -22,7 +22,7 @@ class _Refuse(Exception):  # noqa: N818  a reply, not a mistake
         self.status = status
 
 
-class EmulatedBoard(EmulatedDevice):
+class EmulatedBoard(SerialDevice):
     """The board, with one output and one input."""
 
     profile: FrameProfile

@@ -16,7 +16,7 @@ from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.registers import RejectedRequest
-from hilctl_drivers.emulator.wire import EmulatedReply
+from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
 
 _CORRUPT_AT = 3  # the protocol id (TCP), data (RTU)
 
@@ -108,7 +108,7 @@ def _finish(call: Coroutine[Any, Any, ModbusPDU]) -> ModbusPDU:
     raise AssertionError("a register access waited")
 
 
-class ModbusWire:
+class ModbusWire(EmulatedWire):
     """Devices behind Modbus TCP or RTU: requests from bytes, and replies to bytes.
 
     A device alone on a TCP connection answers to any unit id, as such devices do; on a line, or
@@ -124,21 +124,14 @@ class ModbusWire:
         mute: frozenset[int] = frozenset(),
     ) -> None:
         self._kind = kind
-        self._devices = dict(devices)
+        self._units = devices
+        self.devices = tuple(devices.values())
         self._any_unit = kind == "tcp" and len(devices) == 1
         self._decoder = DecodePDU(is_server=True)
         self._decoder.register(FeedbackPdu)
         self._framer = (FramerSocket if kind == "tcp" else FramerRTU)(self._decoder)
         self._lacking = lacking
         self._mute = mute
-
-    def tick(self, now_ns: int) -> None:
-        """Advance the time for all devices."""
-        for device in self._devices.values():
-            device.tick(now_ns)
-
-    def _device(self, unit: int) -> EmulatedModbus | None:
-        return next(iter(self._devices.values())) if self._any_unit else self._devices.get(unit)
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
         """Yield complete requests, and remove them and those for other devices."""
@@ -147,7 +140,7 @@ class ModbusWire:
             if not used:
                 return
             del received[:used]
-            if pdu and (self._kind == "tcp" or unit in self._devices):
+            if pdu and (self._kind == "tcp" or unit in self._units):
                 yield struct.pack(">HB", transaction, unit) + pdu
 
     def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
@@ -158,7 +151,7 @@ class ModbusWire:
 
     def _reply(self, request: bytes, now_ns: int) -> ModbusPDU:
         unit, function = request[2], request[3]
-        device = self._device(unit)
+        device = self._units.get(min(self._units) if self._any_unit else unit)
         if device is None:
             return ExceptionResponse(function, ExcCodes.GATEWAY_NO_RESPONSE)
         device.request(now_ns)
@@ -178,15 +171,6 @@ class ModbusWire:
     def refusal(self, request: bytes) -> EmulatedReply:
         """Return the exception reply of a device that fails."""
         return self._answered(ExceptionResponse(request[3], ExcCodes.DEVICE_FAILURE), request)
-
-    def mark_invalid(self, until_ns: int) -> None:
-        """Mark the readings of all devices as invalid until a time."""
-        for device in self._devices.values():
-            device.invalid_until_ns = until_ns
-
-    def encode(self, data: bytes) -> bytes:
-        """Return a reply, which has its envelope already."""
-        return data
 
     def corrupt_at(self, framed: bytes) -> int:
         """Return the byte of a reply whose damage must be detected."""

@@ -1,23 +1,21 @@
 """An emulated sensor that sends samples unasked: a profile's blocks in front of the rig."""
 
-from collections.abc import Iterator
-
 from hilctl_drivers.emulator.rig import Bench, EmulatedDevice
-from hilctl_drivers.emulator.wire import EmulatedReply
+from hilctl_drivers.emulator.wire import EmulatedWire
 from hilctl_drivers.sensor_stream.stream_profile import HeaderField, StreamProfile
 
 PERIOD_NS = 1_000_000
 """Time from one block to the next."""
 
 
-class EmulatedStream(EmulatedDevice):
+class EmulatedStream(EmulatedDevice, EmulatedWire):
     """A sensor on a TCP port of its own; its samples come at the profile's highest rate."""
 
     profile: StreamProfile
-    period_ns = PERIOD_NS
 
     def __init__(self, profile: StreamProfile, bench: Bench, sensor: str) -> None:
         super().__init__(profile, bench, None)
+        self.devices = (self,)
         self._source = profile.inputs[sensor]
         self._inputs = profile.inputs.values()
         self._begin_ns: int | None = None
@@ -61,30 +59,6 @@ class EmulatedStream(EmulatedDevice):
             value = (source.valid[1] + 1) * source.scale + source.offset
         frame[source.at : source.at + form.size] = form.encode(value)
         return bytes(frame)
-
-    def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Discard what the host sends."""
-        received.clear()
-        return iter(())
-
-    def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
-        """Return None: it answers nothing."""
-
-    def refusal(self, request: bytes) -> EmulatedReply | None:
-        """Return None: it answers nothing."""
-
-    def mark_invalid(self, until_ns: int) -> None:
-        """Mark its readings as invalid until a time."""
-        self.invalid_until_ns = until_ns
-
-    def encode(self, data: bytes) -> bytes:
-        """Return a block as it is sent."""
-        return data
-
-    def corrupt_at(self, framed: bytes) -> int:
-        """Return the byte of a block whose damage must be detected."""
-        del framed
-        return 0
 
     def _trip(self, due_ns: int) -> None:
         raise AssertionError("it has no watchdog")

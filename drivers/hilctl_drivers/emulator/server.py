@@ -16,11 +16,12 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
-from typing import NamedTuple, Protocol, runtime_checkable
+from typing import NamedTuple
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl_drivers.emulator.options import FaultPlan, WireFault, spoil
+from hilctl_drivers.emulator.sensor_stream import PERIOD_NS, EmulatedStream
 from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
 
 _CHUNK = 65536
@@ -44,9 +45,16 @@ class _Connection(ABC):
     def read(self) -> bytes | None:
         """Return the received bytes; None if the host has closed the connection."""
 
-    @abstractmethod
     def send(self, data: bytes) -> None:
         """Send as much as there is room for; the rest with the next call."""
+        self.unsent += data
+        with suppress(OSError):  # no room, or the host has gone
+            while self.unsent:
+                del self.unsent[: self._write(self.unsent)]
+
+    @abstractmethod
+    def _write(self, data: bytes | bytearray) -> int:
+        """Send without waiting; return the number of bytes that there was room for."""
 
     def unplug(self) -> None:  # noqa: B027  a pulled network cable closes nothing
         """Be silent for good; :meth:`close` is still called."""
@@ -54,18 +62,6 @@ class _Connection(ABC):
     @abstractmethod
     def close(self, *, reset: bool = False) -> None:
         """Close the connection, or break it."""
-
-
-@runtime_checkable
-class StreamWire(EmulatedWire, Protocol):
-    """A wire on which the device sends unasked."""
-
-    period_ns: int
-    stalled_until_ns: int
-
-    def block(self, now_ns: int) -> bytes:
-        """Return what is sent now; called once per period."""
-        ...
 
 
 class _TcpConnection(_Connection):
@@ -84,15 +80,8 @@ class _TcpConnection(_Connection):
             return self._connection.recv(_CHUNK) or None
         return None
 
-    def send(self, data: bytes) -> None:
-        with suppress(OSError):
-            self._connection.sendall(data)
-
-    def push(self, data: bytes) -> None:
-        """Send without waiting; data is lost while the host does not read."""
-        self.unsent += b"" if self.unsent else data
-        with suppress(OSError):
-            del self.unsent[: self._connection.send(self.unsent, socket.MSG_DONTWAIT)]
+    def _write(self, data: bytes | bytearray) -> int:
+        return self._connection.send(data, socket.MSG_DONTWAIT)
 
     def close(self, *, reset: bool = False) -> None:
         if reset:
@@ -120,11 +109,8 @@ class _PtyConnection(_Connection):
             return os.read(self._master, _CHUNK)
         return b""
 
-    def send(self, data: bytes) -> None:
-        self.unsent += data
-        with suppress(BlockingIOError):
-            while self.unsent:
-                del self.unsent[: os.write(self._master, self.unsent)]
+    def _write(self, data: bytes | bytearray) -> int:
+        return os.write(self._master, data)
 
     def unplug(self) -> None:
         os.close(self._master)  # a pulled adapter takes its port along
@@ -178,7 +164,7 @@ class EmulatorServer:
         self._listeners[listener] = wire
         self._wires.append(wire)
         self._selector.register(listener, selectors.EVENT_READ)
-        if isinstance(wire, StreamWire):
+        if isinstance(wire, EmulatedStream):
             self._push(wire, self._clock_ns())
         return f"{host}:{listener.getsockname()[1]}"
 
@@ -255,13 +241,13 @@ class EmulatorServer:
             if connection not in self._connections:
                 return
 
-    def _push(self, wire: StreamWire, now_ns: int) -> None:
-        """Send a stream's next block to its hosts, and schedule the one after it."""
+    def _push(self, wire: EmulatedStream, now_ns: int) -> None:
+        """Send a stream's next block to the hosts that read, and schedule the one after it."""
         data = wire.block(now_ns)
         for connection in self._connections:
-            if connection.wire is wire and isinstance(connection, _TcpConnection):
-                connection.push(data)
-        self._schedule(now_ns + wire.period_ns, partial(self._push, wire))
+            if connection.wire is wire and not connection.unsent:
+                self._send(connection, data)
+        self._schedule(now_ns + PERIOD_NS, partial(self._push, wire))
 
     def _schedule(
         self, due_ns: int, action: Callable[[int], None], superseded_by: _Connection | None = None
@@ -282,7 +268,7 @@ class EmulatorServer:
                 wire.mark_invalid(now_ns + round(fault.delay_s * 1e9))
         if fault is not None and fault.kind == "stall":
             for wire in self._wires:
-                if isinstance(wire, StreamWire):
+                if isinstance(wire, EmulatedStream):
                     wire.stalled_until_ns = now_ns + round(fault.delay_s * 1e9)
         if fault is not None and fault.kind in {"silence", "unplug", "reset", "exception", "late"}:
             self._keep_back(fault, connection, request)

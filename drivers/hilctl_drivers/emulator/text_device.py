@@ -16,8 +16,8 @@ from hilctl_drivers.ascii.ascii_profile import (
     as_text,
     pattern_of,
 )
-from hilctl_drivers.emulator.rig import Bench, EmulatedDevice
-from hilctl_drivers.emulator.wire import EmulatedReply, TemplateMatcher
+from hilctl_drivers.emulator.rig import Bench
+from hilctl_drivers.emulator.wire import EmulatedReply, SerialDevice, TemplateMatcher
 
 _OUT_OF_RANGE = '-222,"Data out of range"'
 _UNDEFINED = '-113,"Undefined header"'
@@ -48,7 +48,7 @@ def _with_number(form: NumberReply, reply: str, number: float) -> str:
     return in_style(reply if form.match(reply) else form.example, form.pattern, number)
 
 
-class EmulatedText(EmulatedDevice):
+class EmulatedText(SerialDevice):
     """The device; ``sensor`` is the input that shows the displacement, None for none."""
 
     profile: AsciiProfile

@@ -1,11 +1,12 @@
-"""Parsing of requests and framing of replies: the contract, and devices on a serial line."""
+"""Parsing of requests and framing of replies: the base, and devices on a serial line."""
 
 import re
+from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from string import Formatter
-from typing import Protocol, TypeAlias
+from typing import TypeAlias
 
 from hilctl_drivers.ascii.ascii_profile import (
     SAMPLES,
@@ -16,6 +17,7 @@ from hilctl_drivers.ascii.ascii_profile import (
 )
 from hilctl_drivers.ascii.ascii_session import FrameFormat, formats, parse_number
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
+from hilctl_drivers.emulator.rig import EmulatedDevice
 from hilctl_drivers.transport.crc import Bytes
 from hilctl_drivers.transport.framing import binary_framing, split_sized
 from hilctl_drivers.transport.links import CorruptError
@@ -36,58 +38,55 @@ class EmulatedReply:
 SerialProfile: TypeAlias = AsciiProfile | FrameProfile
 
 
-class EmulatedWire(Protocol):
-    """Devices that share a line or a port, and their protocol."""
+class EmulatedWire:
+    """Devices that share a line or a port, and their protocol; this one answers nothing."""
+
+    devices: Sequence[EmulatedDevice] = ()
 
     def tick(self, now_ns: int) -> None:
         """Advance the time for all devices."""
-        ...
+        for device in self.devices:
+            device.tick(now_ns)
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
         """Yield complete requests, and remove them from the received bytes."""
-        ...
+        received.clear()
+        return iter(())
 
     def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
         """Execute a request; None if it is for no device here."""
-        ...
 
     def refusal(self, request: bytes) -> EmulatedReply | None:
         """Return an answer that refuses the request."""
-        ...
 
     def mark_invalid(self, until_ns: int) -> None:
         """Mark the readings of all devices as invalid until a time."""
-        ...
+        for device in self.devices:
+            device.invalid_until_ns = until_ns
 
     def encode(self, data: bytes) -> bytes:
         """Return a reply in the form sent on the line."""
-        ...
+        return data
 
     def corrupt_at(self, framed: bytes) -> int:
         """Return the byte of a framed reply whose damage must be detected."""
-        ...
+        raise NotImplementedError
 
 
-class SerialDevice(Protocol):
+class SerialDevice(EmulatedDevice):
     """An emulated device on a line; it sees messages without their framing."""
 
-    invalid_until_ns: int
-
-    def tick(self, now_ns: int) -> None:
-        """Advance the time."""
-        ...
-
+    @abstractmethod
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
         """Execute a message; None if it is for another device."""
-        ...
 
+    @abstractmethod
     def refusal(self, message: bytes) -> EmulatedReply | None:
-        """Return an answer that refuses the request."""
-        ...
+        """Return an answer that refuses the message."""
 
+    @abstractmethod
     def wrong_id(self, reply: bytes) -> bytes:
         """Return a reply in another's name, or to something else."""
-        ...
 
 
 class TemplateMatcher:
@@ -143,8 +142,10 @@ def _frame_size(form: FrameFormat, profile: AsciiProfile) -> Callable[[Bytes], i
     return size_of
 
 
-class EmulatedLine:
+class EmulatedLine(EmulatedWire):
     """Devices on a serial line with the profile's framing; the addressed one answers."""
+
+    devices: Sequence[SerialDevice]
 
     def __init__(self, profile: SerialProfile, devices: Sequence[SerialDevice]) -> None:
         self.devices = devices
@@ -166,11 +167,6 @@ class EmulatedLine:
                 self._messages = requests.messages
             self._encode = lambda message: replies.encode(message.decode())
 
-    def tick(self, now_ns: int) -> None:
-        """Advance the time for all devices."""
-        for device in self.devices:
-            device.tick(now_ns)
-
     def requests(self, received: bytearray) -> Iterator[bytes]:
         """Yield the good messages; an incomplete one is kept, however long it takes."""
         self._received += received
@@ -190,11 +186,6 @@ class EmulatedLine:
     def refusal(self, request: bytes) -> EmulatedReply | None:
         """Return an answer of the first device that says no."""
         return self.devices[0].refusal(request)
-
-    def mark_invalid(self, until_ns: int) -> None:
-        """Mark the readings of all devices as invalid until a time."""
-        for device in self.devices:
-            device.invalid_until_ns = until_ns
 
     def encode(self, data: bytes) -> bytes:
         """Return a reply in the form sent on the line."""
