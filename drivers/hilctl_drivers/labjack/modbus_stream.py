@@ -9,13 +9,12 @@ which is the longest stall of this machine. The first sample is output once that
 import math
 import time
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
 from typing import ClassVar
 
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.device import check_fifo, check_next
@@ -224,71 +223,33 @@ class ModbusStreamOptions(DacOptions):
     fifo_blocks: FifoBlocks = 8
 
 
-@dataclass(frozen=True, slots=True)
-class StreamSetup:
-    """An experiment's options, resolved against the profile.
+def _checked_streaming(setup: ModbusSetup) -> LabJackStreaming:
+    """Return how the device streams; raise InputError if it cannot with these options."""
+    options, profile = setup.options, setup.profile
+    streaming = profile.streaming
+    if streaming == "none":
+        raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
+    if setup.reads_elsewhere:
+        raise InputError("reader must be omitted: input and output are in one scan list")
+    for what, name, known in (
+        ("output", options.output, streaming.outputs),
+        ("input", options.input, streaming.inputs),
+    ):
+        if name not in known:
+            rule = f"{what} must be one that {profile.title} can stream, {', '.join(known)}"
+            raise InputError(f"{rule}, got {name!r}")
+    return streaming
 
-    Attributes:
-        base: Options of the device, streaming or not.
-        streaming: The profile's section on streaming.
-        fifo_blocks: Blocks kept in the device's buffer.
-        target: Address of the output.
-        source: Address of the input.
-    """
 
-    base: ModbusSetup
-    streaming: LabJackStreaming
-    fifo_blocks: int
-    target: int
-    source: int
-
-    @classmethod
-    def of(cls, options: ModbusStreamOptions) -> "StreamSetup":
-        """Resolve options, or raise InputError if they do not fit, or the device cannot stream."""
-        base = ModbusSetup.of(options)
-        profile = base.profile
-        streaming = profile.streaming
-        if streaming == "none":
-            raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
-        if base.reads_elsewhere:
-            raise InputError("reader must be omitted: input and output are in one scan list")
-        for what, name, known in (
-            ("output", options.output, streaming.outputs),
-            ("input", options.input, streaming.inputs),
-        ):
-            if name not in known:
-                rule = f"{what} must be one that {profile.title} can stream, {', '.join(known)}"
-                raise InputError(f"{rule}, got {name!r}")
-        target, source = profile.wire_address(base.output), profile.wire_address(base.input)
-        return cls(base, streaming, options.fifo_blocks, target, source)
-
-    @property
-    def block_max(self) -> int:
-        """Longest block of which one more than ``fifo_blocks`` fit into the buffer."""
-        return max(1, self.streaming.fifo_depth // (self.fifo_blocks + 1))
-
-    def rates(self, block: int) -> RateLimit:
-        """Return the sample rates that it can keep with that block."""
-        per_s, settle_s = self.streaming.samples_per_s_max, self.base.output.settle_s
-        most_hz, whose = self.streaming.rate_max_hz, f"{per_s:g} samples a second for an input and"
-        whose += " an output: its profile"
-        if settle_s * most_hz > 1.0:
-            most_hz, whose = 1.0 / settle_s, f"settling {settle_s * 1e3:.2f} ms: its profile"
-        wire = stream_time(self.base.profile, block)
-        return RateLimit.of(wire, most_hz, whose, self.streaming.rate_min_hz)
-
-    def info(self) -> DeviceInfo:
-        """Return the description of the device."""
-        depth = self.streaming.fifo_depth
-        details = {"fifo_depth": f"{depth} samples", "fifo_level": f"{self.fifo_blocks} blocks"}
-        return self.base.described(
-            "modbus_stream",
-            self.rates(self.block_max),
-            buffered=True,
-            fifo_depth=depth,
-            latency_blocks=self.fifo_blocks,
-            details=details,
-        )
+def _rates(setup: ModbusSetup, streaming: LabJackStreaming, block: int) -> RateLimit:
+    """Return the sample rates that the device can keep with that block."""
+    per_s, settle_s = streaming.samples_per_s_max, setup.output.settle_s
+    most_hz = streaming.rate_max_hz
+    whose = f"{per_s:g} samples a second for an input and an output: its profile"
+    if settle_s * most_hz > 1.0:
+        most_hz, whose = 1.0 / settle_s, f"settling {settle_s * 1e3:.2f} ms: its profile"
+    wire = stream_time(setup.profile, block)
+    return RateLimit.of(wire, most_hz, whose, streaming.rate_min_hz)
 
 
 class StreamSafeWrite(ModbusSafeWrite):
@@ -330,11 +291,25 @@ class ModbusStream(ModbusDevice):
         Raises:
             InputError: The profile cannot be used, or the options do not fit it.
         """
-        self._streaming = setup = StreamSetup.of(options)
-        base, action = setup.base, f"stream {options.output} and {options.input}"
-        super().__init__(base, setup.info(), action, StreamSafeWrite(base, connect), connect)
+        setup = ModbusSetup.of(options)
+        self._streaming = streaming = _checked_streaming(setup)
+        self._fifo_blocks = options.fifo_blocks
+        self._block_max = max(1, streaming.fifo_depth // (options.fifo_blocks + 1))
+        info = setup.described(
+            "modbus_stream",
+            _rates(setup, streaming, self._block_max),
+            buffered=True,
+            fifo_depth=streaming.fifo_depth,
+            latency_blocks=options.fifo_blocks,
+            details={
+                "fifo_depth": f"{streaming.fifo_depth} samples",
+                "fifo_level": f"{options.fifo_blocks} blocks",
+            },
+        )
+        action = f"stream {options.output} and {options.input}"
+        super().__init__(setup, info, action, StreamSafeWrite(setup, connect), connect)
         self._sleep, self._clock = sleep, clock
-        self._chain = base.chain
+        self._chain = setup.chain
         self._stream: StreamSession | None = None
         self._calibration: InputCalibration | None = None
         self._next_sample = 0
@@ -345,43 +320,39 @@ class ModbusStream(ModbusDevice):
         return self._stream
 
     def _longest_block(self) -> tuple[int, str]:
-        depth = self._streaming.streaming.fifo_depth
-        why = f": fifo_blocks + 1 of them must fit into the FIFO, {depth} samples"
-        return self._streaming.block_max, why
+        depth = self._streaming.fifo_depth
+        return self._block_max, f": fifo_blocks + 1 of them must fit into the FIFO, {depth} samples"
 
     def _rates(self, block: int) -> RateLimit:
-        return self._streaming.rates(block)
+        return _rates(self._setup, self._streaming, block)
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Self-test, init steps, calibration, buffers and clock; see :class:`DacDevice`.
 
         The output does not move before enough blocks have come.
         """
-        setup = self._streaming
+        setup, streaming = self._setup, self._streaming
         self._guard.plan(sample_rate_hz / block)
         writer, _ = self._connected()
-        stream = self._stream_on(writer)
-        stream.stop()  # also one of another program: a running stream accepts no settings
-        writer.run(writer.profile.init)
-        writer.run(setup.streaming.setup)
-        self._calibration = stream.calibration(setup.source // 2)
-        stream.prepare(sample_rate_hz, setup.target, setup.source)
-        check_fifo(block, setup.fifo_blocks, stream.capacity)
-        self._safe_write.try_out(writer)
-        self._stream = stream
-        self._next_sample = 0
-        self.transactions = stream_messages(block)
-
-    def _stream_on(self, session: ModbusSession) -> StreamSession:
-        setup = self._setup
-        return StreamSession(
-            ModbusFeedback(session.link, session.unit),
-            self._streaming.streaming,
+        stream = StreamSession(
+            ModbusFeedback(writer.link, writer.unit),
+            streaming,
             setup.options.timeout_s,
             setup.profile.turnaround_s,
             self._sleep,
             self._clock,
         )
+        stream.stop()  # also one of another program: a running stream accepts no settings
+        writer.run(writer.profile.init)
+        writer.run(streaming.setup)
+        source = setup.profile.wire_address(setup.input)
+        self._calibration = stream.calibration(source // 2)
+        stream.prepare(sample_rate_hz, setup.profile.wire_address(setup.output), source)
+        check_fifo(block, self._fifo_blocks, stream.capacity)
+        self._safe_write.try_out(writer)
+        self._stream = stream
+        self._next_sample = 0
+        self.transactions = stream_messages(block)
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
@@ -403,7 +374,7 @@ class ModbusStream(ModbusDevice):
 
     def _readings(self, stream: StreamSession, block: int) -> F64 | None:
         """Return a block's volts, float64[B]; None before the first one is due."""
-        kept = self._streaming.fifo_blocks * block
+        kept = self._fifo_blocks * block
         if self._next_sample < kept:
             return None
         if self._next_sample == kept:
