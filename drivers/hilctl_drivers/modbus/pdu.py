@@ -5,8 +5,7 @@ Sources: "MODBUS Application Protocol Specification" V1.1b3 (sections 6.1 to 6.1
 Serial Line" V1.02 (2.5.1, CRC in 6.2.2), and for function 76 LabJack's "Protocol Details [Direct
 Modbus TCP]". Addresses are PDU addresses: counted from 0. Register data have 2 bytes per register.
 
-Builders raise ``BadRequestError`` for what the specification does not allow: too many or no bits or
-registers, odd data, an address past 65535, an unknown unit, or a PDU over 253 bytes.
+Builders check nothing: a profile is validated, so its addresses, sizes and units are possible.
 """
 
 import struct
@@ -27,13 +26,11 @@ WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS, WRITE_READ = 5, 6, 16, 23
 FEEDBACK = 76
 
 PDU_MAX = 253
-READ_MAX, WRITE_MAX, WRITE_READ_MAX, BITS_MAX = 125, 123, 121, 2000
 TCP_HEAD = 7
 """Bytes of the MBAP header, unit included."""
 _TCP_SHORTEST = TCP_HEAD + 1
 FRAME_HEAD = 4
 """Bytes of a feedback frame before its data."""
-_FRAME_MAX = 255
 _frame_head = struct.Struct(">BHB").pack
 _tcp_start = struct.Struct(">HHH").unpack_from
 
@@ -45,52 +42,29 @@ EXCEPTIONS = {
 }  # fmt: skip
 
 
-def _check_span(what: str, address: int, count: int, count_max: int) -> None:
-    """Raise unless ``count`` bits or registers from ``address`` on exist and fit a message."""
-    if not 1 <= count <= count_max:
-        raise BadRequestError(f"{what} count must be 1 to {count_max} in one message, got {count}")
-    if not 0 <= address <= 0x10000 - count:
-        raise BadRequestError(f"{what} address must be 0 to {0x10000 - count}, got {address}")
-
-
-def _written(address: int, data: bytes, count_max: int) -> int:
-    """Return the number of registers in ``data``; raise if they cannot be written."""
-    if len(data) % 2:
-        raise BadRequestError(f"registers have 2 bytes each, got {len(data)} bytes")
-    _check_span("written register", address, len(data) // 2, count_max)
-    return len(data) // 2
-
-
 def read_pdu(function: int, address: int, count: int) -> bytes:
-    """Return a request to read at most 2000 bits (functions 1, 2) or 125 registers (3, 4)."""
-    bits = function in {READ_COILS, READ_DISCRETE}
-    _check_span("bit" if bits else "register", address, count, BITS_MAX if bits else READ_MAX)
+    """Return a request to read bits (functions 1, 2) or registers (3, 4)."""
     return struct.pack(">BHH", function, address, count)
 
 
 def write_pdu(address: int, data: bytes) -> bytes:
-    """Return a request to write at most 123 registers (function 16)."""
-    count = _written(address, data, WRITE_MAX)
-    return struct.pack(">BHHB", WRITE_REGISTERS, address, count, len(data)) + data
+    """Return a request to write registers (function 16)."""
+    return struct.pack(">BHHB", WRITE_REGISTERS, address, len(data) // 2, len(data)) + data
 
 
 def write_single_pdu(address: int, data: bytes) -> bytes:
     """Return a request to write one register (function 6)."""
-    _written(address, data, 1)
     return struct.pack(">BH", WRITE_REGISTER, address) + data
 
 
 def coil_pdu(address: int, on: bool) -> bytes:
     """Return a request to switch one coil (function 5)."""
-    _check_span("coil", address, 1, 1)
     return struct.pack(">BHH", WRITE_COIL, address, 0xFF00 if on else 0)
 
 
 def write_read_pdu(read_address: int, read_count: int, write_address: int, data: bytes) -> bytes:
-    """Return a request to write at most 121 registers, then read at most 125 (function 23)."""
-    count = _written(write_address, data, WRITE_READ_MAX)
-    _check_span("register", read_address, read_count, READ_MAX)
-    head = (WRITE_READ, read_address, read_count, write_address, count, len(data))
+    """Return a request to write registers, then read registers (function 23)."""
+    head = (WRITE_READ, read_address, read_count, write_address, len(data) // 2, len(data))
     return struct.pack(">BHHHHB", *head) + data
 
 
@@ -103,7 +77,6 @@ class ReadFrame:
 
     def encode(self) -> bytes:
         """Return the frame's bytes."""
-        _check_span("register", self.address, self.words, _FRAME_MAX)
         return _frame_head(0, self.address, self.words)
 
     @property
@@ -122,8 +95,7 @@ class WriteFrame:
 
     def encode(self) -> bytes:
         """Return the frame's bytes."""
-        count = _written(self.address, self.data, _FRAME_MAX)
-        return _frame_head(1, self.address, count) + self.data
+        return _frame_head(1, self.address, len(self.data) // 2) + self.data
 
 
 FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
@@ -133,13 +105,9 @@ def feedback_pdu(*frames: FeedbackFrame) -> bytes:
     """Return a LabJack Modbus Feedback request (76), which executes frames in their order.
 
     A frame is ``00 address16 words8`` to read and ``01 address16 words8 data`` to write. A reply
-    has the words of each read. Both must fit a PDU of the Modbus specification.
+    has the words of each read.
     """
-    pdu = bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
-    longest = max(len(pdu), 1 + sum(frame.reply_size for frame in frames))
-    if longest > PDU_MAX:
-        raise BadRequestError(f"a PDU has at most {PDU_MAX} bytes, got {longest}")
-    return pdu
+    return bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
 
 
 def reply_layout(pdu: bytes) -> tuple[bytes, int]:
@@ -210,7 +178,6 @@ def _place(request_pdu: bytes) -> str:
 
 def tcp_adu(transaction: int, unit: int, pdu: bytes) -> bytes:
     """Return ``pdu`` with its MBAP header, for a unit from 0 to 255."""
-    _check_envelope(unit, 0, pdu)
     return struct.pack(">HHHB", transaction, 0, len(pdu) + 1, unit) + pdu
 
 
@@ -250,8 +217,13 @@ def tcp_missing(received: Bytes) -> int:
 
 
 def rtu_adu(unit: int, pdu: bytes) -> bytes:
-    """Return ``pdu`` with CRC and a unit from 1 to 255; 0 is broadcast, which has no answer."""
-    _check_envelope(unit, 1, pdu)
+    """Return ``pdu`` with CRC, for a unit from 1 to 255.
+
+    Raises:
+        BadRequestError: Unit 0 is broadcast, which has no answer.
+    """
+    if not unit:
+        raise BadRequestError("unit must be 1 to 255, got 0")
     frame = bytes((unit,)) + pdu
     return frame + crc16_modbus(frame).to_bytes(2, "little")
 
@@ -271,10 +243,3 @@ def rtu_pdu(adu: Bytes, unit: int) -> bytes:
     if adu[0] != unit:
         raise MismatchError(f"unit must be {unit}, got {adu[0]}")
     return bytes(adu[1:-2])
-
-
-def _check_envelope(unit: int, unit_min: int, pdu: bytes) -> None:
-    if not unit_min <= unit <= 255:
-        raise BadRequestError(f"unit must be {unit_min} to 255, got {unit}")
-    if not 1 <= len(pdu) <= PDU_MAX:
-        raise BadRequestError(f"a PDU has 1 to {PDU_MAX} bytes, got {len(pdu)}")

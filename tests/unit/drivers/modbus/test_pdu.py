@@ -160,59 +160,9 @@ def test_exception_names_the_address(request_pdu, place):
         reply_data(request_pdu, bytes((request_pdu[0] | 0x80, 2)))
 
 
-@pytest.mark.parametrize(("build", "arguments"), [
-    (read_pdu, (3, 0, 126)),
-    (read_pdu, (4, 0, 0)),
-    (read_pdu, (3, 65535, 2)),
-    (read_pdu, (3, -1, 1)),
-    (read_pdu, (1, 0, 2001)),
-    (read_pdu, (2, 65536, 1)),
-    (write_pdu, (0, bytes(248))),
-    (write_pdu, (0, b"")),
-    (write_pdu, (0, b"abc")),
-    (write_pdu, (65535, FOUR)),
-    (write_single_pdu, (0, FOUR)),
-    (write_single_pdu, (0, b"")),
-    (write_single_pdu, (0, b"a")),
-    (write_single_pdu, (65536, b"ab")),
-    (coil_pdu, (-1, True)),
-    (coil_pdu, (65536, False)),
-    (write_read_pdu, (0, 126, 0, FOUR)),
-    (write_read_pdu, (0, 0, 0, FOUR)),
-    (write_read_pdu, (0, 1, 0, bytes(244))),
-    (write_read_pdu, (0, 1, 0, b"")),
-    (write_read_pdu, (65535, 2, 0, FOUR)),
-    (write_read_pdu, (0, 2, 65535, FOUR)),
-    (read_and_write, (0, bytes(246), 0, 1)),
-    (read_and_write, (0, FOUR, 0, 127)),
-    (read_and_write, (0, b"abc", 0, 2)),
-    (read_and_write, (65535, FOUR, 0, 2)),
-    (read_and_write, (0, FOUR, 65536, 1)),
-    (tcp_adu, (0, 256, FOUR)),
-    (tcp_adu, (0, 1, b"")),
-    (tcp_adu, (0, 1, bytes(254))),
-    (rtu_adu, (0, FOUR)),
-    (rtu_adu, (256, FOUR)),
-    (rtu_adu, (1, bytes(254))),
-])  # fmt: skip
-def test_what_the_specification_does_not_allow_is_not_built(build, arguments):
-    """Counts, addresses past 65535, odd data, units and transactions."""
+def test_a_broadcast_is_not_built():
     with pytest.raises(BadRequestError):
-        build(*arguments)
-
-
-@pytest.mark.parametrize("pdu", [
-    read_pdu(1, 63536, 2000),
-    read_pdu(3, 65411, 125),
-    write_pdu(65413, bytes(246)),
-    write_read_pdu(65411, 125, 65415, bytes(242)),
-    read_and_write(0, bytes(244), 65410, 126),
-    coil_pdu(65535, True),
-])  # fmt: skip
-def test_the_largest_of_each_fits(pdu):
-    assert len(pdu) <= 253
-    assert reply_size(pdu) <= 253
-    assert rtu_pdu(rtu_adu(247, pdu), 247) == tcp_pdu(tcp_adu(65535, 0, pdu), 65535, 0) == pdu
+        rtu_adu(0, FOUR)
 
 
 @pytest.mark.parametrize(("pdu", "reply"), [
