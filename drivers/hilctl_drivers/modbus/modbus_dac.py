@@ -203,9 +203,8 @@ class ModbusDac(ModbusDevice):
         One transaction is tried by writing what the output holds already.
         """
         swap = self._combined(writer)
-        readback = self._setup.output.readback_register
-        if swap is not None and readback is not None:
-            held = writer.read_bytes(readback)  # no answer here: there is no device
+        held = None if swap is None else writer.held_data(self._setup.output)
+        if swap is not None and held is not None:
             try:
                 swap(held)
                 return swap, True

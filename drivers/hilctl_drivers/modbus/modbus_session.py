@@ -53,7 +53,6 @@ from hilctl_drivers.modbus.register_map import (
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
 from hilctl_drivers.transport.links import (
-    BadRequestError,
     CorruptError,
     IncompleteError,
     Link,
@@ -100,9 +99,6 @@ class Transaction(ABC):
     def missing(self, received: Bytes) -> int:
         """Return the number of missing bytes; 0 if the reply is complete."""
 
-    def _bad_size(self, data: bytes) -> BadRequestError:
-        return BadRequestError(f"request was prepared for {self._data_size} bytes, got {len(data)}")
-
 
 class TcpTransaction(Transaction):
     """A prepared Modbus TCP :class:`Transaction`; each request has the next transaction id."""
@@ -121,8 +117,6 @@ class TcpTransaction(Transaction):
     def request(self, data: bytes = b"") -> bytes:
         """See :meth:`Transaction.request`."""
         if data:
-            if len(data) != self._data_size:
-                raise self._bad_size(data)
             self._data = data
             if self._echo:
                 self._head = self._head[:-2] + data
@@ -167,8 +161,6 @@ class RtuTransaction(Transaction):
         """See :meth:`Transaction.request`."""
         if not data:
             return self._last
-        if len(data) != self._data_size:
-            raise self._bad_size(data)
         table, crc = MODBUS_WORDS, self._before_crc
         for word in self._written_words(data):
             crc = table[crc ^ word]
@@ -290,6 +282,17 @@ class ModbusSession:
     def write_bytes(self, register: Register, data: bytes) -> None:
         """Write what :meth:`read_bytes` returns."""
         self.call(self.prepare(write_request(self.profile, register, data)))
+
+    def held_data(self, output: ModbusOutput) -> bytes | None:
+        """Return the register bytes that write what an output holds; None if not known."""
+        register = output.readback_register
+        if register is None:
+            return None
+        data = self.read_bytes(register)
+        if register.format == output.format:
+            return data
+        value = register.format.decode(data)
+        return output.format.encode(value) if output.min <= value <= output.max else None
 
     def held(self, output: ModbusOutput) -> float | None:
         """Return the content of an output's register, in its unit; None if it cannot be read."""

@@ -61,14 +61,14 @@ class ModbusWatchdogDriver:
         self.write_through(session, lambda: session.write_bytes(output, data))
 
     def _tripped(self, session: ModbusSession) -> bool:
-        has, readback = self._has, self._setup.output.readback_register
+        has, output = self._has, self._setup.output
         assert has != "none"
         if has.tripped != "none":
             return session.is_set(has.tripped)
-        if not has.refuses_while_tripped or readback is None:
-            return False
+        held = session.held_data(output) if has.refuses_while_tripped else None
         try:  # what it holds already moves nothing
-            session.write_bytes(self._setup.output, session.read_bytes(readback))
+            if held is not None:
+                session.write_bytes(output, held)
         except RefusedError:
             return True
         return False
@@ -173,18 +173,12 @@ class ModbusSafeWrite:
 
     def try_out(self, session: ModbusSession) -> None:
         """Write the held value with the message of the safe value, see :func:`try_out`."""
-        output, register = self._setup.output, self._setup.output.readback_register
-        if register is None:
-            return
-        data = session.read_bytes(register)
-        value = register.format.decode(data)
-
-        def put() -> None:
-            same = register.format == output.format
-            self._put(session, data if same else output.format.encode(value))
-
-        name = f"{self._setup.options.output}, register {output.address}"
-        try_out(output, value, put, f"to {name}")
+        output = self._setup.output
+        data = session.held_data(output)
+        if data is not None:
+            name = f"{self._setup.options.output}, register {output.address}"
+            value = output.format.decode(data)
+            try_out(output, value, lambda: self._put(session, data), f"to {name}")
 
     def _request(self, session: ModbusSession, value: float) -> bytes:
         output = self._setup.output

@@ -60,13 +60,12 @@ class SafeExchange:
         self._quiet_s = _QUIET_S
 
 
-def try_out(output: Range, held: float | None, put: Callable[[], None], how: str) -> None:
+def try_out(output: Range, held: float, put: Callable[[], None], how: str) -> None:
     """Write what an output holds, with the message that writes the safe value; nothing moves.
 
-    An output that cannot be read (``held`` is None), or is out of range, is left alone. ``how``
-    names register or message in errors.
+    An output that is out of range is left alone. ``how`` names register or message in errors.
     """
-    if held is None or not output.min <= held <= output.max:
+    if not output.min <= held <= output.max:
         return
     try:
         put()

@@ -528,21 +528,6 @@ def test_transaction_ids_wrap_and_are_in_the_reply():
     assert transaction.reply(H("0001 0000 0005 01 03 02 0007")) == H("0007")
 
 
-@ALL
-@BOTH
-def test_data_of_another_size_is_refused_and_changes_nothing(case, wire):
-    """The request can't grow or shrink by accident."""
-    transaction, _, (_, size, _, _) = prepared(case, wire)
-    before = bytes(transaction.request())
-    for data in (b"a", b"abc", b"abcdef"):
-        with pytest.raises(
-            links.BadRequestError, match=f"prepared for {size} bytes, got {len(data)}"
-        ):
-            transaction.request(data)
-    after = bytes(transaction.request())
-    assert (after if wire == "rtu" else after[2:]) == (before if wire == "rtu" else before[2:])
-
-
 @BOTH
 def test_replies_of_another_length_are_refused(wire):
     transaction, wrap, _ = prepared("read", wire)
