@@ -12,6 +12,7 @@ from typing import Any, ClassVar, Self, cast
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
+from hilctl_drivers.device import details_of
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.profile_base import Range
 from hilctl_drivers.signal_chain import (
@@ -135,23 +136,41 @@ class DacSetup:
 
     def info(self, kind: str, rates: RateLimit, **more: Any) -> DeviceInfo:
         """Return the description of a device of this kind; ``more`` depends on the protocol."""
-        options, writer, reader = self.options, self.writer, self.reader
+        options, writer, reader, chain = self.options, self.writer, self.reader, self.chain
         description = f"{writer.profile.title} at {writer.place}: {options.output}"
         details = writer.profile.provenance()
-        details |= {"link": writer.profile.link.model_dump_json(), **options.details()}
+        details["link"] = writer.profile.link.model_dump_json()
+        details |= details_of(options.model_dump(mode="json", exclude_none=True))
         details["input_unit"] = self.input.unit
         details |= more.pop("details", {})
+        files = {"profile.yaml": options.profile.text}
+        if options.reader is not None:
+            files["reader_profile.yaml"] = options.reader.profile.text
         if self.reads_elsewhere:
             description += f"; {reader.profile.title}{self._reader_place}"
             details |= reader.profile.provenance("reader_")
             details["reader_link"] = reader.profile.link.model_dump_json()
         position = f" in {self.input.unit}" if self.input.per_unit("um") else ""
         description += f"{':' if self.reads_elsewhere else ','} {options.input}{position}"
-        return self.chain.info(
-            kind,
-            options,
-            rates,
+        if options.watchdog != "none":
+            more |= {
+                "watchdog_command": options.watchdog.safe_command,
+                "watchdog_timeout_s": options.watchdog.timeout_s,
+                "watchdog_reason": options.watchdog.reason,
+            }
+        return DeviceInfo(
+            name=kind,
             description=description,
+            command_unit=chain.command_unit,
+            command_min=chain.command_range[0],
+            command_max=chain.command_range[1],
+            command_step=chain.command_step,
+            sensor_min_um=chain.displacement_range[0],
+            sensor_max_um=chain.displacement_range[1],
+            max_rate_hz=rates.highest_hz,
+            rate_note=rates.note,
+            files=files,
+            calibration=options.calibration_file,
             holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
             details=details,
             ages_readings=self._reader_class.AGES,

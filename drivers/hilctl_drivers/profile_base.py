@@ -292,6 +292,12 @@ class BaseProfile(StrictModel):
         return None
 
     @property
+    def sensor_inputs(self) -> dict[str, Range]:
+        """The inputs for a sensor: those that do not measure the device's own output."""
+        inputs = self.inputs.items()
+        return {k: each for k, each in inputs if getattr(each, "measures", "") != "output"}
+
+    @property
     def title(self) -> str:
         """Vendor and model."""
         return f"{self.vendor} {self.model}"

@@ -9,20 +9,19 @@ import re
 from collections.abc import Mapping
 from contextlib import suppress
 from ipaddress import ip_address
-from typing import Annotated, Any, Literal, Self, TypeAlias, TypeVar
+from typing import Annotated, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
 from pydantic import AfterValidator, Field, model_validator
 
 from hilctl.base.calibration import AmplifierCalibration, NamedCalibration
-from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
 from hilctl.base.types import F64, CommandUnit
-from hilctl_drivers.device import CalibrationName, details_of
+from hilctl_drivers.device import CalibrationName
 from hilctl_drivers.profile import ProfileName
 from hilctl_drivers.profile_base import Range, Watchdog
-from hilctl_drivers.transport.wire_time import RateLimit
 
 PROFILE = "name of a shipped profile, or path of your own relative to the experiment's folder"
 
@@ -318,17 +317,6 @@ class DacOptions(AddressOptions):
         """The calibration to apply."""
         return self.calibration if isinstance(self.calibration, NamedCalibration) else None
 
-    def details(self) -> dict[str, str]:
-        """Return the options for a recording: texts, other values as JSON."""
-        return details_of(self.model_dump(mode="json", exclude_none=True))
-
-    def files(self) -> dict[str, str]:
-        """Return the texts of the profiles for a recording."""
-        named = {"profile.yaml": self.profile}
-        if self.reader is not None:
-            named["reader_profile.yaml"] = self.reader.profile
-        return {name: each.text for name, each in named.items()}
-
 
 class SignalChain:
     """Conversion of commands to output values and of input values to displacements.
@@ -405,29 +393,6 @@ class SignalChain:
         """Fill in the displacements of a block of input values, um."""
         np.multiply(values, self._um_per_unit, out=displacement_um)
         displacement_um += self._offset_um
-
-    def info(self, name: str, options: DacOptions, rates: RateLimit, **more: Any) -> DeviceInfo:
-        """Return the description of a device; ``more`` depends on the protocol."""
-        if options.watchdog != "none":
-            more |= {
-                "watchdog_command": options.watchdog.safe_command,
-                "watchdog_timeout_s": options.watchdog.timeout_s,
-                "watchdog_reason": options.watchdog.reason,
-            }
-        return DeviceInfo(
-            name=name,
-            command_unit=self.command_unit,
-            command_min=self.command_range[0],
-            command_max=self.command_range[1],
-            command_step=self.command_step,
-            sensor_min_um=self.displacement_range[0],
-            sensor_max_um=self.displacement_range[1],
-            max_rate_hz=rates.highest_hz,
-            rate_note=rates.note,
-            files=options.files(),
-            calibration=options.calibration_file,
-            **more,
-        )
 
 
 def channel(what: str, name: str, channels: Mapping[str, _Channel], title: str) -> _Channel:

@@ -61,47 +61,34 @@ def starting_section(
     """
     profile = load_profile(name_or_path)
     reader = profile if reader_name is None else load_profile(reader_name)
-    inputs = {
-        key: each
-        for key, each in reader.inputs.items()
-        if getattr(each, "measures", "terminal") == "terminal"
-    }
     channels = channels or {}
-    _refuse_missing("output", profile.outputs, profile)
-    _refuse_missing("input", inputs, reader)
+    if not profile.outputs:
+        raise InputError(
+            f"{profile.title} has no output: it reads the sensor for another device; name that, "
+            "and this with --reader"
+        )
+    if not reader.sensor_inputs:
+        raise InputError(
+            f"{reader.title} has no input for a displacement sensor: name the profile of what "
+            "reads it with --reader"
+        )
     made = StartingSection(profile.title, {"kind": profile.DEVICE}, notes=profile.notes)
-    _add(made, "profile", name_or_path)
+    made.values["profile"] = name_or_path
     _place(made, "", profile)
     output = _chosen(made, "output", profile.outputs, channels)
     if reader_name is not None:
         made.values["reader"] = _reader(made, reader_name, profile, reader)
-    of = "of the reader, " if reader_name is not None else ""
-    sensor_input = _chosen(made, "input", inputs, channels, of)
+    sensor_input = _chosen(made, "input", reader.sensor_inputs, channels)
+    if reader_name is not None:
+        made.remarks["input"] = f"of the reader, {made.remarks['input']}"
     _amplifier(made, output, unit)
     _sensor(made, sensor_input)
     _watchdog(made, profile.watchdog)
     return made
 
 
-def _refuse_missing(what: str, channels: Mapping[str, Range], profile: BaseProfile) -> None:
-    if not channels and what == "output":
-        raise InputError(
-            f"{profile.title} has no output: it reads the sensor for another device; name that, "
-            "and this with --reader"
-        )
-    if not channels:
-        raise InputError(
-            f"{profile.title} has no input for a displacement sensor: name the profile of what "
-            "reads it with --reader"
-        )
-
-
 def _chosen(
-    made: StartingSection,
-    key: str,
-    known: Mapping[str, _Channel],
-    channels: Mapping[str, str],
-    of: str = "",
+    made: StartingSection, key: str, known: Mapping[str, _Channel], channels: Mapping[str, str]
 ) -> _Channel:
     """Add the output or input, the first one by default, and return it."""
     names = tuple(known)
@@ -109,17 +96,12 @@ def _chosen(
     if name not in known:
         raise InputError(f"device.{key} must be one of {', '.join(names)} (got {name!r})")
     channel = known[name]
+    made.values[key] = name
     span = f"{channel.min:g} to {channel.max:g} {channel.unit}"
-    _add(made, key, name, f"{of}{span}; it has {', '.join(names)}")
+    made.remarks[key] = f"{span}; it has {', '.join(names)}"
     if len(names) > 1:
         made.choices[key] = names
     return channel
-
-
-def _add(made: StartingSection, key: str, value: object, remark: str = "") -> None:
-    made.values[key] = value
-    if remark:
-        made.remarks[key] = remark
 
 
 def _ask(made: StartingSection, key: str, question: str, remark: str) -> None:
@@ -185,7 +167,8 @@ def _sensor(made: StartingSection, sensor_input: Range) -> None:
 
 def _watchdog(made: StartingSection, has: Watchdog | str) -> None:
     if not isinstance(has, Watchdog):
-        _add(made, "watchdog", "none", "it has none: if this machine dies, the output stays")
+        made.values["watchdog"] = "none"
+        made.remarks["watchdog"] = "it has none: if this machine dies, the output stays"
         return
     silence_s = min(max(_SILENCE_S, has.min_s), has.max_s)
     made.values["watchdog"] = {"timeout_s": silence_s, "safe_command": 0.0}

@@ -4,7 +4,7 @@ import gc
 import shlex
 import signal
 from collections.abc import Callable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -18,7 +18,6 @@ from hilctl.base.formatting import finite_json
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, load_document
 from hilctl_drivers.emulator.factory import Emulator, build
-from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLine, parse_fault
 from hilctl_drivers.emulator.rig import ACTUATORS
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
@@ -251,28 +250,13 @@ def emulate(
     serve(options, partial(_say, as_json=as_json))
 
 
-@dataclass(frozen=True, slots=True)
-class ListenAddress:
-    """Address of an emulated device."""
-
-    profile: str
-    address: str  # host:port or device file
-    unit_id: int | None = None  # if another Modbus device is served beside it
-
-
-def _say(
-    places: Sequence[ListenAddress],
-    emulator: Emulator,
-    *,
-    as_json: bool,
-    wired: WiredExperiment | None = None,
-) -> None:
+def _say(emulator: Emulator, *, as_json: bool, wired: WiredExperiment | None = None) -> None:
     if as_json:
-        typer.echo(finite_json(_report(places, emulator, wired)))
+        typer.echo(finite_json(_report(emulator, wired)))
         return
-    for each in places:
-        unit = f", unit {each.unit_id}" if each.unit_id is not None else ""
-        typer.echo(f"{each.profile} answers at {each.address}{unit}")
+    for profile, address, unit_id in emulator.places:
+        unit = f", unit {unit_id}" if unit_id is not None else ""
+        typer.echo(f"{profile} answers at {address}{unit}")
     wiring, info = emulator.device.wiring, emulator.actuator.info
     gain, offset, um_per_unit, offset_um = wiring.factors
     unit = wiring.command_unit
@@ -288,14 +272,12 @@ def _say(
         typer.echo(f"hilctl {shlex.join(wired.words(emulator))}")
 
 
-def _report(
-    places: Sequence[ListenAddress], emulator: Emulator, wired: WiredExperiment | None
-) -> dict[str, Any]:
+def _report(emulator: Emulator, wired: WiredExperiment | None) -> dict[str, Any]:
     wiring, suffix = emulator.device.wiring, emulator.device.wiring.command_unit.lower()
     names = f"gain_{suffix}", f"offset_{suffix}", "sensor_um", "offset_um"
     terminals = {key: emulator.options[key] for key in ("output", "input")}
     report = {
-        "devices": [asdict(each) for each in places],
+        "devices": [each._asdict() for each in emulator.places],
         "wiring": terminals | dict(zip(names, wiring.factors, strict=True)),
     }
     if wired is not None:
@@ -303,9 +285,7 @@ def _report(
     return report
 
 
-def serve(
-    options: EmulatorOptions, on_ready: Callable[[Sequence[ListenAddress], Emulator], None]
-) -> None:
+def serve(options: EmulatorOptions, on_ready: Callable[[Emulator], None]) -> None:
     """Serve an emulator until SIGINT or SIGTERM; call ``on_ready`` once its devices answer."""
     emulator = build(options)
 
@@ -317,22 +297,9 @@ def serve(
     gc.freeze()  # a collection of all that was imported takes tens of ms
     before = {each: signal.signal(each, stop) for each in (signal.SIGINT, signal.SIGTERM)}
     try:
-        on_ready(_places(options, emulator), emulator)
+        on_ready(emulator)
         emulator.server.run()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
         emulator.log.close()
-
-
-def _places(options: EmulatorOptions, emulator: Emulator) -> list[ListenAddress]:
-    if options.reader is None:
-        return [ListenAddress(options.profile, emulator.address)]
-    unit_id = reader_unit_id = None
-    if isinstance(emulator.device, EmulatedModbus):
-        unit_id = emulator.device.profile.unit_id
-        reader_unit_id = emulator.reader_unit_id
-    return [
-        ListenAddress(options.profile, emulator.address, unit_id),
-        ListenAddress(options.reader, emulator.reader_address, reader_unit_id),
-    ]

@@ -39,6 +39,14 @@ class _Port(NamedTuple):
     faulty: bool = True
 
 
+class ListenAddress(NamedTuple):
+    """Address of an emulated device."""
+
+    profile: str
+    address: str  # host:port or device file
+    unit_id: int | None  # if another Modbus device is served beside it
+
+
 @dataclass(frozen=True, slots=True)
 class Emulator:
     """A server that is ready to run; its log is to be closed at the end."""
@@ -49,10 +57,13 @@ class Emulator:
     reader: AnyDevice  # shows the displacement, often the same
     actuator: SimulatedDevice
     wires: tuple[EmulatedWire, ...]  # one, or the reader's too
-    address: str  # host:port, or the pty's device file
-    reader_address: str
-    reader_unit_id: int | None  # None if it is no Modbus device
+    places: tuple[ListenAddress, ...]  # of the device, and of the reader if it is another one
     options: dict[str, Any]  # address and wiring, as in an experiment's device section
+
+    @property
+    def address(self) -> str:
+        """Address of the device."""
+        return self.places[0].address
 
 
 def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns) -> Emulator:
@@ -76,9 +87,7 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
         reader=reader,
         actuator=plan.actuator,
         wires=tuple(port.wire for port in ports),
-        address=addresses[0],
-        reader_address=addresses[-1],
-        reader_unit_id=plan.reader_unit_id,
+        places=plan.listen_addresses(addresses),
         options={**plan.channels(), **plan.places(addresses)},
     )
 
@@ -96,18 +105,11 @@ class _Plan:
         self._options = options
         self._profile = profile = load_profile(options.profile)
         self._reader = reader = profile if options.reader is None else load_profile(options.reader)
-        sensors = [
-            name
-            for name, each in reader.inputs.items()
-            if getattr(each, "measures", "terminal") == "terminal"
-        ]
-        outputs = list(profile.outputs)
+        outputs, sensors = list(profile.outputs), list(reader.sensor_inputs)
         self._output = _chosen("output to drive the rig with", options.output, outputs, profile)
         self._sensor = _chosen("input to show a displacement at", options.sensor, sensors, reader)
-        self.actuator, self.wiring = _rig(
-            options, profile.outputs[self._output], reader.inputs[self._sensor]
-        )
         source = reader.inputs[self._sensor]
+        self.actuator, self.wiring = _rig(options, profile.outputs[self._output], source)
         markers = [getattr(source, key, None) for key in ("validity", "invalid", "valid")]
         if set(markers) <= {"none", None} and any(
             each.kind == "invalid" for each in options.faults
@@ -216,6 +218,19 @@ class _Plan:
         if amplifier is not None:
             made["amplifier"] = amplifier.model_dump(exclude_none=True)
         return made
+
+    def listen_addresses(self, addresses: list[str]) -> tuple[ListenAddress, ...]:
+        """Return where the devices are served, with their unit ids if there are two."""
+        options, profile = self._options, self._profile
+        if options.reader is None:
+            return (ListenAddress(options.profile, addresses[0], None),)
+        units: tuple[int | None, int | None] = None, None
+        if isinstance(profile, ModbusProfile):
+            units = profile.unit_id, self.reader_unit_id
+        return (
+            ListenAddress(options.profile, addresses[0], units[0]),
+            ListenAddress(options.reader, addresses[-1], units[1]),
+        )
 
     def places(self, addresses: list[str]) -> dict[str, Any]:
         """Return the part of a device section with the addresses of the devices."""

@@ -25,8 +25,8 @@ _NOTE_SIZE = 64
 """Room for that time, with its header."""
 
 
-def _connected(address: tuple[str, int], timeout_s: float) -> socket.socket:
-    """Return a connection without Nagle's delay, or raise LostError."""
+def _connected(address: tuple[str, int], timeout_s: float) -> tuple[socket.socket, str]:
+    """Return a connection without Nagle's delay, and the peer's address, or raise LostError."""
     try:
         made = socket.create_connection(address, timeout_s)
     except TimeoutError:
@@ -39,10 +39,10 @@ def _connected(address: tuple[str, int], timeout_s: float) -> socket.socket:
         # kernel sends an old command again when the cable is back.
         unacknowledged_ms = math.ceil(timeout_s * 1e3)
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_USER_TIMEOUT, unacknowledged_ms)
+        return made, str(made.getpeername()[0])
     except OSError as error:  # reset since
         made.close()
         raise LostError(f"can't connect: {why(error)}") from None
-    return made
 
 
 def _reset(connection: socket.socket) -> None:
@@ -70,12 +70,7 @@ class TcpLink:
     def open(self) -> None:
         """Connect, see :meth:`~hilctl_drivers.transport.links.Link.open`."""
         self.close()
-        made = _connected(self._address, self._timeout_s)
-        try:
-            self.peer_host = made.getpeername()[0]
-        except OSError as error:  # reset since
-            made.close()
-            raise LostError(f"can't connect: {why(error)}") from None
+        made, self.peer_host = _connected(self._address, self._timeout_s)
         made.settimeout(None)
         # The kernel's own time-outs spare the poll() before each call that Python's would cost.
         seconds, fraction = divmod(self._timeout_s, 1.0)
@@ -159,10 +154,10 @@ class TcpReceiver:
         """Connect; raise LostError if no device answers."""
         self.close()
         self._looked_ns = time.monotonic_ns()
-        self._socket = made = _connected(self._address, self._timeout_s)
-        made.setblocking(False)
+        self._socket, _ = _connected(self._address, self._timeout_s)
+        self._socket.setblocking(False)
         try:
-            made.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         except OSError as error:  # reset since
             raise LostError(f"connection lost: {why(error)}") from None
 
@@ -235,12 +230,9 @@ class TcpStream(StreamLink):
     def open(self, *, boot: bool = True) -> None:
         """Connect, see :meth:`StreamLink.open`."""
         self.close()
-        self._socket = made = _connected((self.peer_host, self._port), self.timeout_s)
+        made, self.peer_host = _connected((self.peer_host, self._port), self.timeout_s)
+        self._socket = made
         self._use(made.fileno())  # with its time-out set, Python keeps it non-blocking
-        try:
-            self.peer_host = made.getpeername()[0]
-        except OSError as error:  # reset since
-            raise self._failed(error) from None
         if boot:
             self._stale = True
 

@@ -206,7 +206,7 @@ def test_a_reader_that_fails_is_named(rig):
     bench.open()
     bench.exchange(0.0)
     bench.emulator.wires[1].devices = []
-    port = bench.emulator.reader_address
+    port = bench.emulator.places[1].address
     with pytest.raises(DeviceError, match=rf"reader agilent_34970a at {port}: "):
         exchange_until_it_fails(bench, 0.0)
 

@@ -10,8 +10,7 @@ from hilctl_drivers.template import starting_section
 ALONE = [
     name
     for name in shipped_profiles()
-    if (each := load_profile(name)).outputs
-    and any(getattr(one, "measures", "terminal") == "terminal" for one in each.inputs.values())
+    if (each := load_profile(name)).outputs and each.sensor_inputs
 ]
 
 

@@ -10,12 +10,7 @@ from typer.testing import CliRunner
 
 from hilctl.base.errors import InputError
 from hilctl.cli.commands import app
-from hilctl_drivers.emulator.emulate_command import (
-    ListenAddress,
-    is_experiment,
-    serve,
-    wired_experiment,
-)
+from hilctl_drivers.emulator.emulate_command import is_experiment, serve, wired_experiment
 from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.emulator.server import EmulatorServer
@@ -31,10 +26,10 @@ CONFIGS = Path(__file__).parents[4] / "configs"
     ("kepco_bop", "agilent_34970a", {}, r"(/dev/pts/\d+) (?!\1)/dev/pts/\d+"),
 ])  # fmt: skip
 def test_it_says_where_both_answer(profile, reader, options, places):
-    told: list[ListenAddress] = []
+    told = []
 
-    def on_ready(places, emulator):
-        told.extend(places)
+    def on_ready(emulator):
+        told.extend(emulator.places)
         signal.raise_signal(signal.SIGTERM)
 
     serve(EmulatorOptions(profile, reader=reader, **options), on_ready)

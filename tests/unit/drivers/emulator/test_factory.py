@@ -17,9 +17,7 @@ DRIVING = [name for name in shipped_profiles() if load_profile(name).outputs]
 @pytest.mark.parametrize("actuator", [TerfenolOptions(), PiezoOptions()])
 def test_every_profile_drives_every_actuator(emulate, name, actuator):
     profile, reader = load_profile(name), None
-    if not any(
-        getattr(each, "measures", "terminal") == "terminal" for each in profile.inputs.values()
-    ):
+    if not profile.sensor_inputs:
         reader = "adam_4117" if isinstance(profile, ModbusProfile) else "agilent_34970a"
     in_a = next(iter(profile.outputs.values())).unit == "A"
     if in_a and isinstance(actuator, PiezoOptions):
