@@ -28,11 +28,10 @@ from hilctl_drivers.labjack.stream import (
     u32,
 )
 from hilctl_drivers.modbus.config import ModbusSetup, session_at
-from hilctl_drivers.modbus.modbus_dac import ModbusDevice
+from hilctl_drivers.modbus.modbus_dac import Connect, ModbusDevice
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusProfile
 from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import FeedbackFrame, ReadFrame, WriteFrame
-from hilctl_drivers.modbus.watchdog import Connect, ModbusSafeWrite
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks
 from hilctl_drivers.transport.links import RefusedError
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
@@ -252,28 +251,6 @@ def _rates(setup: ModbusSetup, streaming: LabJackStreaming, block: int) -> RateL
     return RateLimit.of(wire, most_hz, whose, streaming.rate_min_hz)
 
 
-class StreamSafeWrite(ModbusSafeWrite):
-    """Stops the stream and writes the output in one message; queued values are dropped."""
-
-    def _put(self, session: ModbusSession, data: bytes) -> None:
-        feedback = ModbusFeedback(session.link, session.unit)
-        write = WriteFrame(self._setup.profile.wire_address(self._setup.output), data)
-        # The stream first: it would write over the safe value with its next scan.
-        try:
-            feedback.call([WriteFrame(ENABLE, u32(0)), write])
-        except RefusedError:  # a stream that does not run can't be stopped
-            feedback.call([write])
-
-    def _held(self, session: ModbusSession) -> float:
-        output = self._setup.output
-        feedback = ModbusFeedback(session.link, session.unit)
-        target = ReadFrame(self._setup.profile.wire_address(output), output.words)
-        running, held = feedback.call([ReadFrame(ENABLE, 2), target])
-        if running != u32(0):
-            raise DeviceError("the stream was stopped, but still runs")
-        return output.format.decode(held)
-
-
 class ModbusStream(ModbusDevice):
     """A :class:`~hilctl.base.device.Device` that streams over Modbus TCP."""
 
@@ -307,7 +284,7 @@ class ModbusStream(ModbusDevice):
             },
         )
         action = f"stream {options.output} and {options.input}"
-        super().__init__(setup, info, action, StreamSafeWrite(setup, connect), connect)
+        super().__init__(setup, info, action, connect)
         self._sleep, self._clock = sleep, clock
         self._chain = setup.chain
         self._stream: StreamSession | None = None
@@ -349,7 +326,7 @@ class ModbusStream(ModbusDevice):
         self._calibration = stream.calibration(source // 2)
         stream.prepare(sample_rate_hz, setup.profile.wire_address(setup.output), source)
         check_fifo(block, self._fifo_blocks, stream.capacity)
-        self._safe_write.try_out(writer)
+        self._try_out_safe_value(writer)
         self._stream = stream
         self._next_sample = 0
         self.transactions = stream_messages(block)
@@ -383,10 +360,23 @@ class ModbusStream(ModbusDevice):
         assert self._calibration is not None
         return self._calibration.volts(stream.take(block))
 
-    def _put_out(self, command: float) -> None:
-        """Stop the stream and set the output to ``command``; queued values are dropped."""
-        self._release()
-        self._safe_write.attempt(self._peer, self._chain.output(command))
+    def _write(self, session: ModbusSession, data: bytes) -> None:
+        feedback = ModbusFeedback(session.link, session.unit)
+        write = WriteFrame(self._setup.profile.wire_address(self._setup.output), data)
+        # The stream first: it would write over the safe value with its next scan.
+        try:
+            feedback.call([WriteFrame(ENABLE, u32(0)), write])
+        except RefusedError:  # a stream that does not run can't be stopped
+            feedback.call([write])
+
+    def _held(self, session: ModbusSession) -> float:
+        output = self._setup.output
+        feedback = ModbusFeedback(session.link, session.unit)
+        target = ReadFrame(self._setup.profile.wire_address(output), output.words)
+        running, held = feedback.call([ReadFrame(ENABLE, 2), target])
+        if running != u32(0):
+            raise DeviceError("the stream was stopped, but still runs")
+        return output.format.decode(held)
 
     def _close(self) -> None:
         # The stream first: an output that moves must not be without its watchdog.

@@ -13,15 +13,17 @@ from typing import ClassVar, TypeAlias
 import numpy as np
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
-from hilctl.base.errors import DeviceError
+from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl.base.types import F64
 from hilctl_drivers.dac_setup import SensorReader
 from hilctl_drivers.device import DacDevice
+from hilctl_drivers.endpoint import Endpoint
 from hilctl_drivers.modbus.config import ModbusOptions, ModbusSetup, session_at
 from hilctl_drivers.modbus.modbus_profile import ModbusInput
 from hilctl_drivers.modbus.modbus_session import ModbusSession, combined_request, write_request
-from hilctl_drivers.modbus.watchdog import Connect, ModbusSafeWrite, ModbusWatchdogDriver
+from hilctl_drivers.modbus.watchdog import ModbusWatchdogDriver
 from hilctl_drivers.transport.links import NoAnswerError, RefusedError
+from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back, try_out
 from hilctl_drivers.transport.stream_link import StreamLink
 
 Swap: TypeAlias = Callable[[bytes], float]
@@ -32,25 +34,23 @@ specification lets the device write first.
 """
 
 
+Connect: TypeAlias = Callable[[Endpoint], ModbusSession]
+"""Makes a session on a new link."""
+
+
 class ModbusDevice(DacDevice):
     """Session, watchdog and safe value of ``modbus_dac`` and ``modbus_stream``."""
 
-    def __init__(
-        self,
-        setup: ModbusSetup,
-        info: DeviceInfo,
-        action: str,
-        safe_write: ModbusSafeWrite,
-        connect: Connect,
-    ) -> None:
+    def __init__(self, setup: ModbusSetup, info: DeviceInfo, action: str, connect: Connect) -> None:
         writer = setup.writer
         title = f"{info.name} {writer.name} at {writer.place}"
         super().__init__(info, title, action, setup.options.output)
         self._setup = setup
         self._connect = connect
         self._peer = writer
-        self._safe_write = safe_write
         self._guard = ModbusWatchdogDriver(setup)
+        self._safe_exchange = SafeExchange()
+        self._safe_session: ModbusSession | None = None
         self._writer: ModbusSession | None = None
         self._reader: SensorReader | None = None
 
@@ -98,6 +98,62 @@ class ModbusDevice(DacDevice):
             return displacement_um, None  # the register keeps the last command
         return displacement_um, setup.chain.command(held)
 
+    def _put_out(self, command: float) -> None:
+        value, opened = self._setup.chain.output(command), self._writer or self._safe_session
+        if opened is not None and not isinstance(opened.link, StreamLink):
+            # Many devices take one connection only. The reader is closed afterwards: the port of a
+            # sensor that hangs can take its time.
+            opened.link.close()
+            opened = None
+        session = opened or self._connect(self._peer)
+        link = session.link
+        try:
+            # No self-test, no init steps, no reader: none of them may cost the safe value.
+            if isinstance(link, StreamLink):
+                self._safe_session = session  # it knows whether answers are outstanding
+                data = self._setup.output.format.encode(value)
+                write = session.prepare(write_request(session.profile, self._setup.output, data))
+                self._safe_exchange.attempt(
+                    link,
+                    lambda: link.send_now(write.request()),
+                    lambda: self._confirm(session, value),
+                )
+            else:
+                # A new connection: no answer to an older command can come on it.
+                link.open()
+                self._confirm(session, value)
+        finally:
+            link.close()
+
+    def _confirm(self, session: ModbusSession, value: float) -> None:
+        """Write ``value``, in the output's unit; raise unless the device confirms it."""
+        output = self._setup.output
+        data = output.format.encode(value)
+        self._guard.write_through(session, lambda: self._write(session, data))
+        if self._setup.unconfirmed:
+            raise UnconfirmedError(f"the value was sent, but {self._setup.unconfirmed}")
+        found = self._held(session)
+        if found is not None:
+            tolerance = max(output.step, 1e-6 * (output.max - output.min))
+            check_read_back(output, value, found, tolerance)
+
+    def _try_out_safe_value(self, session: ModbusSession) -> None:
+        """Write the held value with the message of the safe value, see :func:`try_out`."""
+        output = self._setup.output
+        data = session.held_data(output)
+        if data is not None:
+            name = f"{self._setup.options.output}, register {output.address}"
+            value = output.format.decode(data)
+            try_out(output, value, lambda: self._write(session, data), f"to {name}")
+
+    def _write(self, session: ModbusSession, data: bytes) -> None:
+        """Write the output's register bytes once."""
+        session.write_bytes(self._setup.output, data)
+
+    def _held(self, session: ModbusSession) -> float | None:
+        """Return the content of the output's register; None if it cannot be read."""
+        return session.held(self._setup.output)
+
     def _close(self) -> None:
         if self._writer is not None and self._reader is not None:
             # First: nothing feeds it any more, and it would trip while the close steps run.
@@ -128,7 +184,7 @@ class ModbusDac(ModbusDevice):
         setup = ModbusSetup.of(options)
         action = f"write {options.output}, read {options.input}"
         info = setup.described("modbus_dac", setup.sample_rates(setup.may_combine))
-        super().__init__(setup, info, action, ModbusSafeWrite(setup, connect), connect)
+        super().__init__(setup, info, action, connect)
         self._factors = setup.chain.factors
         self._encode = setup.output.format.encode
         self._swap: Swap = _not_open
@@ -151,7 +207,7 @@ class ModbusDac(ModbusDevice):
         if not self._setup.reads_elsewhere:
             reader.read()  # a missing address must show before the output moves
         swap, self.one_transaction = self._find_swap(writer, reader)
-        self._safe_write.try_out(writer)
+        self._try_out_safe_value(writer)
         rates = self._setup.sample_rates(self.one_transaction)
         how = "one transaction" if self.one_transaction else "a read and a write"
         replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
@@ -171,16 +227,6 @@ class ModbusDac(ModbusDevice):
             measured[0] = self._measure() * gain + offset
         if self._guard.feed_every and self._writer is not None:
             self._guard.feed(self._writer)
-
-    def _put_out(self, command: float) -> None:
-        value = self._setup.chain.output(command)
-        opened = self._writer
-        if opened is not None and not isinstance(opened.link, StreamLink):
-            # Many devices take one connection only. The reader is closed afterwards: the port of a
-            # sensor that hangs can take its time.
-            opened.link.close()
-            opened = None
-        self._safe_write.attempt(self._peer, value, opened)
 
     def _abandon(self) -> None:
         """Keep a serial port, where opening it anew could reset a board before it is safe.

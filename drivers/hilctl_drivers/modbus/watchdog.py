@@ -1,18 +1,14 @@
-"""Host watchdog of a Modbus device, and the write of the safe value."""
+"""Host watchdog of a Modbus device."""
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import TypeAlias
 
-from hilctl.base.errors import DeviceError, UnconfirmedError
-from hilctl_drivers.endpoint import Endpoint
+from hilctl.base.errors import DeviceError
 from hilctl_drivers.modbus.config import ModbusSetup
 from hilctl_drivers.modbus.modbus_profile import ModbusWatchdog
-from hilctl_drivers.modbus.modbus_session import ModbusSession, write_request
+from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.register_map import ModbusStep, RegisterStep
 from hilctl_drivers.transport.links import RefusedError
-from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back, try_out
-from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.wire_time import check_feeds
 
 
@@ -127,78 +123,3 @@ class ModbusWatchdogDriver:
             return ()
         safe = self._setup.chain.output(self._wanted.safe_command)
         return has.bound(steps, self._setup.output, self._wanted.timeout_s, safe)
-
-
-Connect: TypeAlias = Callable[[Endpoint], ModbusSession]
-"""Makes a session on a new link."""
-
-
-class ModbusSafeWrite:
-    """Writes the output of a device, one attempt per call."""
-
-    def __init__(self, setup: ModbusSetup, connect: Connect) -> None:
-        self._setup = setup
-        self._connect = connect
-        self._guard = ModbusWatchdogDriver(setup)
-        self._exchange = SafeExchange()
-        self._session: ModbusSession | None = None
-
-    def attempt(self, peer: Endpoint, value: float, opened: ModbusSession | None = None) -> None:
-        """Write the output and have the device confirm it; the link is closed afterwards.
-
-        Args:
-            peer: The device; best with a numeric address, which needs no name server.
-            value: In the output's unit.
-            opened: A session on an open line without framing; None to open a connection.
-        """
-        if opened is None and self._session is not None:
-            opened = self._session  # which knows whether answers are outstanding on the line
-        session = opened or self._connect(peer)
-        link = session.link
-        try:
-            # No self-test, no init steps, no reader: none of them may cost the safe value.
-            if isinstance(link, StreamLink):
-                self._session = session
-                self._exchange.attempt(
-                    link,
-                    lambda: link.send_now(self._request(session, value)),
-                    lambda: self._write(session, value),
-                )
-            else:
-                # A new connection: no answer to an older command can come on it.
-                link.open()
-                self._write(session, value)
-        finally:
-            link.close()
-
-    def try_out(self, session: ModbusSession) -> None:
-        """Write the held value with the message of the safe value, see :func:`try_out`."""
-        output = self._setup.output
-        data = session.held_data(output)
-        if data is not None:
-            name = f"{self._setup.options.output}, register {output.address}"
-            value = output.format.decode(data)
-            try_out(output, value, lambda: self._put(session, data), f"to {name}")
-
-    def _request(self, session: ModbusSession, value: float) -> bytes:
-        output = self._setup.output
-        pdu = write_request(session.profile, output, output.format.encode(value))
-        return session.prepare(pdu).request()
-
-    def _write(self, session: ModbusSession, value: float) -> None:
-        data = self._setup.output.format.encode(value)
-        self._guard.write_through(session, lambda: self._put(session, data))
-        if self._setup.unconfirmed:
-            raise UnconfirmedError(f"the value was sent, but {self._setup.unconfirmed}")
-        found, output = self._held(session), self._setup.output
-        if found is not None:
-            tolerance = max(output.step, 1e-6 * (output.max - output.min))
-            check_read_back(output, value, found, tolerance)
-
-    def _put(self, session: ModbusSession, data: bytes) -> None:
-        """Write the output's register bytes once."""
-        session.write_bytes(self._setup.output, data)
-
-    def _held(self, session: ModbusSession) -> float | None:
-        """Return the content of the output's register; None if it cannot be read."""
-        return session.held(self._setup.output)

@@ -378,13 +378,13 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
     driven, monkeypatch, running, held_v, holds
 ):
     """Each alone is not: a running stream writes over the output with its next scan."""
-    safe_write = driven().device._safe_write
-    safe_write._put = lambda session, data: None
-    encoded = safe_write._setup.output.format.encode(held_v)
+    device = driven().device
+    device._write = lambda session, data: None
+    encoded = device._setup.output.format.encode(held_v)
     answer = SimpleNamespace(call=lambda frames: [stream.u32(running), encoded])
     monkeypatch.setattr("hilctl_drivers.labjack.modbus_stream.ModbusFeedback", lambda *_: answer)
     with nullcontext() if holds else pytest.raises(DeviceError):
-        safe_write._write(SimpleNamespace(link=None, unit=1), 1.0)
+        device._confirm(SimpleNamespace(link=None, unit=1), 1.0)
 
 
 @pytest.mark.parametrize(("changes", "text"), [

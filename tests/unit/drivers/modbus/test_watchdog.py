@@ -223,13 +223,13 @@ def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
     made.link.late_s = late_s
     with pytest.raises(DeviceError, match="no answer"):
         made.exchange(4.0)
-    put_out = made.device._safe_write._put
+    write = made.device._write
 
-    def written_over(session, value):
-        put_out(session, value)
+    def written_over(session, data):
+        write(session, data)
         made.time.sleep(late_s)
 
-    made.device._safe_write._put = written_over
+    made.device._write = written_over
     with pytest.raises(DeviceError, match=r"0 V .*but 4"):
         made.device.make_safe(0.0)
     made.device.make_safe(0.0)
@@ -239,15 +239,15 @@ def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
 def test_a_step_of_the_output_is_no_other_value(driven):
     """Which of two neighbours a device rounds to is its own affair; floats round to a millionth."""
     for profile in ("adam_6024", "generic_float32"):
-        safe_write = driven(profile).device._safe_write
-        output = safe_write._setup.output
+        device = driven(profile).device
+        output = device._setup.output
         step = output.step or 1e-6 * (output.max - output.min)
         assert step > 0.0
-        safe_write._put = lambda session, data: None
-        safe_write._held = lambda session, found=step: found
-        safe_write._write(None, 0.0)
+        device._write = lambda session, data: None
+        device._held = lambda session, found=step: found
+        device._confirm(None, 0.0)
         with pytest.raises(DeviceError):
-            safe_write._write(None, -0.01 * step)
+            device._confirm(None, -0.01 * step)
 
 
 def test_no_name_is_looked_up_for_it():
