@@ -340,6 +340,9 @@ class InProcessLink:
         """Return the received reply; override it to inject faults."""
         return reply
 
+    def doubt(self):
+        self.close()
+
     def close(self):
         self.is_open = False
 

@@ -1,4 +1,4 @@
-"""A DAC's options resolved against the profiles, and the session that reads its sensor.
+"""A DAC on a link: its options resolved against the profiles, and the session with its sensor.
 
 The sensor is read by the device with the output or by another one, the reader, of any protocol. The
 reader has a link of its own, or shares the line or connection of the output.
@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, cast
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
-from hilctl_drivers.device import details_of
+from hilctl_drivers.device import DacDevice, details_of
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.profile_base import Range
 from hilctl_drivers.signal_chain import (
@@ -23,6 +23,7 @@ from hilctl_drivers.signal_chain import (
     measuring_input,
 )
 from hilctl_drivers.transport.links import Link, naming
+from hilctl_drivers.transport.safe_exchange import SafeExchange
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 
@@ -259,3 +260,80 @@ class SensorReader(ABC):
 
     def _finish(self) -> None:  # noqa: B027  a board has no steps
         """Run the close steps."""
+
+
+class SessionReader(SensorReader):
+    """A reader whose session runs the steps of a profile; each protocol has its session."""
+
+    def __init__(self, setup: DacSetup, link: Link) -> None:
+        """See :class:`SensorReader`."""
+        super().__init__(setup, link)
+        self._session = self.session_on(setup.reader, self._link)
+        self._read_input = self._session.input_reader(setup.input)
+
+    @staticmethod
+    @abstractmethod
+    def session_on(endpoint: Endpoint, link: Link) -> Any:
+        """Return a session with the device."""
+
+    def _identify(self) -> None:
+        self._session.check_selftest()
+
+    def _set_up(self) -> None:
+        self._session.run(self._session.profile.init)
+
+    def _read(self) -> float:
+        return float(self._read_input())
+
+    def _finish(self) -> None:
+        self._session.run(self._session.profile.close)
+
+
+class WiredDac(DacDevice):
+    """A DAC on a link, with the session that reads its sensor; its errors name its place."""
+
+    def __init__(self, setup: DacSetup, info: DeviceInfo, action: str, link: Link) -> None:
+        writer, output = setup.writer, setup.options.output
+        super().__init__(info, f"{info.name} {writer.name} at {writer.place}", action, output)
+        self._setup, self._chain, self._link = setup, setup.chain, link
+        self._safe_exchange = SafeExchange()
+
+    def _output(self) -> float | None:
+        held = self._held()
+        return None if held is None else self._chain.command(held)
+
+    def _abandon(self) -> None:
+        """Keep a serial port: opening it again could reset a board before its output is safe.
+
+        The reader is kept too: the safe value must not wait until its port is closed.
+        """
+        self._link.doubt()
+
+    def _put_out(self, command: float) -> None:
+        # No self-test, no init steps, no reader: none of them may cost the safe value.
+        value = self._chain.output(command)
+        self._safe_exchange.attempt(
+            self._link, lambda: self._send(value), lambda: self._confirm(value)
+        )
+
+    @abstractmethod
+    def _held(self) -> float | None:
+        """Return the output's value in its unit; None if it cannot be known."""
+
+    @abstractmethod
+    def _send(self, value: float) -> None:
+        """Send ``value``, in the output's unit, without waiting for an answer."""
+
+    @abstractmethod
+    def _confirm(self, value: float) -> None:
+        """Write ``value``, in the output's unit.
+
+        Raises:
+            UnconfirmedError: It was sent, and no answer of the device would confirm it.
+            DeviceError: The device did not confirm it.
+        """
+
+    def _release(self) -> None:
+        self._link.close()
+        if self._reader is not None:
+            self._reader.release()

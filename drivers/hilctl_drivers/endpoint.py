@@ -6,7 +6,6 @@ from hilctl.base.errors import InputError
 from hilctl_drivers.profile import check_baud, with_link
 from hilctl_drivers.profile_base import BaseProfile, SerialLineSettings, StreamSettings
 from hilctl_drivers.signal_chain import LINE, PORT, STREAM, AddressOptions, DacOptions
-from hilctl_drivers.transport.links import Link
 from hilctl_drivers.transport.resource_names import held_address, held_port
 from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.stream_link import StreamLink
@@ -72,12 +71,6 @@ class Endpoint:
         if self.host:
             return held_address(self.host, int(self.port))
         return held_port(str(self.port))
-
-    def reached(self, link: Link) -> "Endpoint":
-        """Return this with the numeric address of an open link, so no name is looked up again."""
-        if isinstance(link, TcpLink | TcpStream):
-            return replace(self, host=link.peer_host)
-        return self
 
     def link(self) -> TcpLink | StreamLink:
         """Return a new link."""

@@ -12,10 +12,10 @@ from typing import ClassVar
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
-from hilctl_drivers.dac_setup import DacSetup
-from hilctl_drivers.device import DacDevice
+from hilctl_drivers.dac_setup import DacSetup, WiredDac
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, Measure
-from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back
+from hilctl_drivers.transport.safe_exchange import check_read_back
+from hilctl_drivers.transport.stream_link import StreamLink
 
 _PROMPT_S = 0.2
 """A longer delay of the safe value is mentioned in ``safe_note``."""
@@ -28,13 +28,14 @@ class SerialOptions(DacOptions):
     fifo_blocks: FifoBlocks = 8
 
 
-class SerialDac(DacDevice):
-    """A :class:`~hilctl_drivers.device.DacDevice` on a serial line or a TCP stream.
+class SerialDac(WiredDac):
+    """A :class:`~hilctl_drivers.dac_setup.WiredDac` on a serial line or a TCP stream.
 
     ``SerialDac(options)`` makes the subclass that the profile names as its driver.
     """
 
     Options: ClassVar[type[DeviceOptions]] = SerialOptions
+    _link: StreamLink
     block_max = 1  # samples of one exchange
     fifo_depth = 0  # samples; 0 without a FIFO
     measures = False  # whether exchanges fill ``measured``
@@ -62,11 +63,9 @@ class SerialDac(DacDevice):
         self._setup = setup = DacSetup.of(options)
         self._chain = setup.chain
         self._link = setup.writer.stream()
-        self._safe_exchange = SafeExchange()
         self._prepare()
-        title = f"serial_dac {setup.writer.name} at {setup.writer.place}"
         action = f"write {options.output}, read {options.input}"
-        super().__init__(self._describe(), title, action, options.output)
+        super().__init__(setup, self._describe(), action, self._link)
 
     @abstractmethod
     def _prepare(self) -> None:
@@ -103,35 +102,7 @@ class SerialDac(DacDevice):
     def _longest_block(self) -> tuple[int, str]:
         return self.block_max, ""
 
-    def _abandon(self) -> None:
-        """Keep the port: opening it again could reset a board before its output is safe."""
-        self._link.doubt()
-
-    def _put_out(self, command: float) -> None:
-        value = self._chain.output(command)
-        self._safe_exchange.attempt(
-            self._link, lambda: self._send(value), lambda: self._confirm(value)
-        )
-
-    @abstractmethod
-    def _send(self, value: float) -> None:
-        """Send ``value``, in the output's unit, without waiting for an answer."""
-
-    @abstractmethod
-    def _confirm(self, value: float) -> None:
-        """Write ``value``, in the output's unit.
-
-        Raises:
-            UnconfirmedError: It was sent, and no answer of the device would confirm it.
-            DeviceError: The device did not confirm it.
-        """
-
     def _check_read_back(self, wanted: float, found: float) -> None:
         """Reject a read-back that differs from the written value by more than two steps."""
         output = self._setup.output
         check_read_back(output, wanted, found, 2.0 * output.step)
-
-    def _release(self) -> None:
-        self._link.close()
-        if self._reader is not None:
-            self._reader.release()

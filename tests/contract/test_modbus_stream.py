@@ -10,7 +10,6 @@ from hilctl.base.errors import DeviceError
 from hilctl.experiment.devices import device_class
 from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture driven
 from hilctl_drivers.contract import DrivenDevice
-from hilctl_drivers.modbus.config import session_at
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from tests.fakes import InProcess
@@ -32,7 +31,7 @@ class DrivenStream(DrivenDevice):
         options = {**self.emulated.options, "profile": profile, "fifo_blocks": FIFO_BLOCKS}
         device = chosen(
             chosen.Options.model_validate(options),
-            connect=lambda peer: session_at(peer, self.emulated.link),
+            link=self.emulated.link,
             sleep=self.emulated.time.sleep,
             clock=self.emulated.time,
         )

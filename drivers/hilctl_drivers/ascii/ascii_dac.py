@@ -113,11 +113,7 @@ class AsciiDac(SerialDac):
             measured[0] = self._writer.value(self._measure) * gain + offset
         self._feed()
 
-    def _output(self) -> float | None:
-        return self._as_command(self._held())
-
     def _held(self) -> float | None:
-        """Return the output's value in its unit; None if it cannot be known."""
         readback, watchdog = self._target.readback, self._profile.watchdog
         if readback == "none":
             return None
@@ -129,10 +125,8 @@ class AsciiDac(SerialDac):
     def _look(self) -> tuple[float, float | None]:
         self._connect()
         displacement_um = self._chain.displacement_um(self._sensor.read())
-        return displacement_um, self._as_command(self._measured_output())
-
-    def _as_command(self, value: float | None) -> float | None:
-        return None if value is None else self._chain.command(value)
+        output = self._measured_output()
+        return displacement_um, None if output is None else self._chain.command(output)
 
     def _close(self) -> None:
         if self._options.watchdog != "none":

@@ -10,7 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from functools import partial
-from typing import ClassVar, Literal, TypeAlias
+from typing import ClassVar, Literal, TypeAlias, cast
 
 from hilctl.base.errors import DeviceError
 from hilctl.base.formatting import printable
@@ -32,7 +32,8 @@ from hilctl_drivers.ascii.ascii_profile import (
     as_text,
     fill,
 )
-from hilctl_drivers.dac_setup import DacSetup, SensorReader
+from hilctl_drivers.dac_setup import SessionReader
+from hilctl_drivers.endpoint import Endpoint
 from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.crc import CRCS, Bytes, Crc, dcon_checksum, gen_checksum
@@ -234,7 +235,7 @@ class AsciiSession:
         address: int | None = None,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self._profile = profile
+        self.profile = profile
         self._requests, self._replies = formats(profile.link)
         # An echo of frames is removed by the link.
         self._echoes = profile.link.echo and not profile.link.settings.echo
@@ -285,6 +286,10 @@ class AsciiSession:
         """Ask for the value of an input, in its unit; NaN if the reading is invalid."""
         return source.value(reading(source, partial(self.query, self.text(source.ask))))
 
+    def input_reader(self, source: AsciiInput) -> Callable[[], float]:
+        """Return a function that asks for the value of an input."""
+        return partial(self.value, source)
+
     def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
         """Execute steps with ``timeout`` and ``safe``; raise DeviceError if one fails."""
         for step in steps:
@@ -296,7 +301,7 @@ class AsciiSession:
 
     def check_errors(self) -> None:
         """Ask for errors that commands without an answer have left; raise RefusedError for one."""
-        query = self._profile.error_query
+        query = self.profile.error_query
         if query != "none":
             text, reply = self._ask(query)
             if not query.match(reply):
@@ -304,7 +309,7 @@ class AsciiSession:
 
     def check_selftest(self) -> None:
         """Run the self-test; raise DeviceError if it is another device."""
-        test = self._profile.selftest
+        test = self.profile.selftest
         if test != "none":
             text, reply = self._ask(test)
             if not test.match(reply):
@@ -312,7 +317,7 @@ class AsciiSession:
 
     def tripped(self) -> bool:
         """Return whether the host watchdog has tripped; False if it cannot be asked."""
-        watchdog = self._profile.watchdog
+        watchdog = self.profile.watchdog
         if watchdog == "none" or watchdog.tripped == "none":
             return False
         return watchdog.tripped.match(self._ask(watchdog.tripped)[1]) is not None
@@ -374,7 +379,7 @@ class AsciiSession:
         if self._refusal != "none" and self._refusal.match(reply):
             said = "ignored, the host watchdog has tripped: output is at its safe value"
             raise WatchdogTrippedError(f"{text}: {said}", reply)
-        for error in self._profile.errors:
+        for error in self.profile.errors:
             if error.match(reply):
                 raise RefusedError(f"{text}: {error.meaning} ({reply})", reply)
         who = _ADDRESSED.match(reply)
@@ -430,34 +435,18 @@ def query_time(profile: AsciiProfile, query: AsciiInput) -> WireTime:
     return _lines_time(profile, [_question(profile, query)], query.settle_s)
 
 
-class TextReader(SensorReader):
+class TextReader(SessionReader):
     """A :class:`~hilctl_drivers.dac_setup.SensorReader` for lines of text."""
 
-    def __init__(self, setup: DacSetup, link: Link) -> None:
-        """See :class:`~hilctl_drivers.dac_setup.SensorReader`."""
-        super().__init__(setup, link)
-        profile, source = setup.reader.profile, setup.input
-        assert isinstance(profile, AsciiProfile)
-        assert isinstance(source, AsciiInput)
-        self._profile, self._source = profile, source
-        self._session = AsciiSession(profile, self._link, setup.reader.unit)
+    @staticmethod
+    def session_on(endpoint: Endpoint, link: Link) -> AsciiSession:
+        """See :meth:`~hilctl_drivers.dac_setup.SessionReader.session_on`."""
+        return AsciiSession(cast(AsciiProfile, endpoint.profile), link, endpoint.unit)
 
     @staticmethod
     def time(profile: AsciiProfile, source: AsciiInput) -> WireTime:
         """See :meth:`~hilctl_drivers.dac_setup.SensorReader.time`."""
         return query_time(profile, source).named(f"to {profile.title}")
-
-    def _identify(self) -> None:
-        self._session.check_selftest()
-
-    def _set_up(self) -> None:
-        self._session.run(self._profile.init)
-
-    def _read(self) -> float:
-        return self._session.value(self._source)
-
-    def _finish(self) -> None:
-        self._session.run(self._profile.close)
 
 
 def feed_time(profile: AsciiProfile) -> WireTime | None:

@@ -107,9 +107,9 @@ class BoardDac(SerialDac):
         wire = self._setup.after_reading(exchange_time(self._profile, block))
         return self._setup.rates(wire, lowest_hz, settle_s(self._profile))
 
-    def _output(self) -> float | None:
+    def _held(self) -> float | None:
         state = self._session.state()
-        return None if state is None else self._chain.command(state.output)
+        return None if state is None else state.output
 
     def _look(self) -> tuple[float, float | None]:
         self._connect()

@@ -27,13 +27,12 @@ from hilctl_drivers.labjack.stream import (
     f32,
     u32,
 )
-from hilctl_drivers.modbus.config import ModbusSetup, session_at
-from hilctl_drivers.modbus.modbus_dac import Connect, ModbusDevice
+from hilctl_drivers.modbus.config import ModbusSetup
+from hilctl_drivers.modbus.modbus_dac import ModbusDevice
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusProfile
-from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import FeedbackFrame, ReadFrame, WriteFrame
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks
-from hilctl_drivers.transport.links import RefusedError
+from hilctl_drivers.transport.links import Link, RefusedError
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 _RATE_TOLERANCE = 1e-4
@@ -259,11 +258,11 @@ class ModbusStream(ModbusDevice):
     def __init__(
         self,
         options: ModbusStreamOptions,
-        connect: Connect = session_at,
+        link: Link | None = None,
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Describe the device; nothing is sent before :meth:`open`.
+        """Describe the device, on a new link or the given one; nothing is sent before :meth:`open`.
 
         Raises:
             InputError: The profile cannot be used, or the options do not fit it.
@@ -284,9 +283,8 @@ class ModbusStream(ModbusDevice):
             },
         )
         action = f"stream {options.output} and {options.input}"
-        super().__init__(setup, info, action, connect)
+        super().__init__(setup, info, action, link)
         self._sleep, self._clock = sleep, clock
-        self._chain = setup.chain
         self._stream: StreamSession | None = None
         self._calibration: InputCalibration | None = None
         self._next_sample = 0
@@ -310,9 +308,11 @@ class ModbusStream(ModbusDevice):
         """
         setup, streaming = self._setup, self._streaming
         self._guard.plan(sample_rate_hz / block)
-        writer, _ = self._connected()
+        self._connect()
+        writer = self._writer
+        self._guard.end_trip(writer)  # a device that has tripped refuses the steps that follow
         stream = StreamSession(
-            ModbusFeedback(writer.link, writer.unit),
+            ModbusFeedback(self._link, writer.unit),
             streaming,
             setup.options.timeout_s,
             setup.profile.turnaround_s,
@@ -326,7 +326,7 @@ class ModbusStream(ModbusDevice):
         self._calibration = stream.calibration(source // 2)
         stream.prepare(sample_rate_hz, setup.profile.wire_address(setup.output), source)
         check_fifo(block, self._fifo_blocks, stream.capacity)
-        self._try_out_safe_value(writer)
+        self._try_out_safe_value()
         self._stream = stream
         self._next_sample = 0
         self.transactions = stream_messages(block)
@@ -344,7 +344,7 @@ class ModbusStream(ModbusDevice):
         stream.feed(self._chain.output(command))
         self._next_sample += command.size
         readings = self._readings(stream, command.size)
-        if self._guard.feed_every and self._writer is not None:
+        if self._guard.feed_every:
             self._guard.feed(self._writer)
         if readings is not None:
             self._chain.fill_um(readings, displacement_um)
@@ -360,8 +360,8 @@ class ModbusStream(ModbusDevice):
         assert self._calibration is not None
         return self._calibration.volts(stream.take(block))
 
-    def _write(self, session: ModbusSession, data: bytes) -> None:
-        feedback = ModbusFeedback(session.link, session.unit)
+    def _write(self, data: bytes) -> None:
+        feedback = ModbusFeedback(self._link, self._writer.unit)
         write = WriteFrame(self._setup.profile.wire_address(self._setup.output), data)
         # The stream first: it would write over the safe value with its next scan.
         try:
@@ -369,11 +369,11 @@ class ModbusStream(ModbusDevice):
         except RefusedError:  # a stream that does not run can't be stopped
             feedback.call([write])
 
-    def _held(self, session: ModbusSession) -> float:
+    def _read_back(self) -> float:
         output = self._setup.output
-        feedback = ModbusFeedback(session.link, session.unit)
         target = ReadFrame(self._setup.profile.wire_address(output), output.words)
-        running, held = feedback.call([ReadFrame(ENABLE, 2), target])
+        frames = [ReadFrame(ENABLE, 2), target]
+        running, held = ModbusFeedback(self._link, self._writer.unit).call(frames)
         if running != u32(0):
             raise DeviceError("the stream was stopped, but still runs")
         return output.format.decode(held)

@@ -5,7 +5,7 @@ from typing import Any, Literal, cast
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
-from hilctl_drivers.dac_setup import DacSetup, SensorReader
+from hilctl_drivers.dac_setup import DacSetup, SessionReader
 from hilctl_drivers.endpoint import Endpoint
 from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusOutput, ModbusProfile
 from hilctl_drivers.modbus.modbus_session import (
@@ -123,29 +123,8 @@ class ModbusSetup(DacSetup):
         )
 
 
-class ModbusReader(SensorReader):
+class ModbusReader(SessionReader):
     """A :class:`~hilctl_drivers.dac_setup.SensorReader` for Modbus."""
 
-    def __init__(self, setup: DacSetup, link: Link) -> None:
-        """See :class:`~hilctl_drivers.dac_setup.SensorReader`."""
-        super().__init__(setup, link)
-        source = cast(ModbusInput, setup.input)
-        self._session = session_at(setup.reader, self._link)
-        self._read_input = self._session.input_reader(source)
-
-    @staticmethod
-    def time(profile: ModbusProfile, source: ModbusInput) -> WireTime:
-        """See :meth:`~hilctl_drivers.dac_setup.SensorReader.time`."""
-        return read_time(profile, source)
-
-    def _identify(self) -> None:
-        self._session.check_selftest()
-
-    def _set_up(self) -> None:
-        self._session.run(self._session.profile.init)
-
-    def _read(self) -> float:
-        return self._read_input()
-
-    def _finish(self) -> None:
-        self._session.run(self._session.profile.close)
+    session_on = staticmethod(session_at)
+    time = staticmethod(read_time)

@@ -422,9 +422,9 @@ def exchange_time(
     return _requests_time(profile, [*both, *after], written.settle_s + read.settle_s)
 
 
-def read_time(profile: ModbusProfile, sensor: ModbusInput) -> WireTime:
+def read_time(profile: ModbusProfile, source: ModbusInput) -> WireTime:
     """Return the time to read an input."""
-    return _requests_time(profile, read_requests(profile, sensor), sensor.settle_s)
+    return _requests_time(profile, read_requests(profile, source), source.settle_s)
 
 
 def read_requests(profile: ModbusProfile, sensor: ModbusInput) -> list[bytes]:

@@ -61,6 +61,10 @@ class Link(Protocol):
         """
         ...
 
+    def doubt(self) -> None:
+        """Note a failure: what an older request can still cause must not affect the next one."""
+        ...
+
     def close(self) -> None:
         """Close the link; closing twice is fine."""
         ...

@@ -60,17 +60,15 @@ class TcpLink:
     def __init__(
         self, host: str, port: int, timeout_s: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._address = (host, port)
+        self._host, self._port = host, port  # a numeric address after connecting
         self._timeout_s = timeout_s
         self._clock = clock
         self._socket: socket.socket | None = None
-        self.peer_host = host
-        """Numeric address of the peer after connecting; before that, ``host``."""
 
     def open(self) -> None:
         """Connect, see :meth:`~hilctl_drivers.transport.links.Link.open`."""
         self.close()
-        made, self.peer_host = _connected(self._address, self._timeout_s)
+        made, self._host = _connected((self._host, self._port), self._timeout_s)
         made.settimeout(None)
         # The kernel's own time-outs spare the poll() before each call that Python's would cost.
         seconds, fraction = divmod(self._timeout_s, 1.0)
@@ -130,6 +128,10 @@ class TcpLink:
         if self._socket is not None:
             _reset(self._socket)
             self._socket = None
+
+    def doubt(self) -> None:
+        """Close the connection: the next one has no late replies."""
+        self.close()
 
     def close(self) -> None:
         """Close the connection."""
@@ -222,15 +224,13 @@ class TcpStream(StreamLink):
         echo: bool = False,
     ) -> None:
         super().__init__(gap_s, timeout_s, echo=echo)
-        self._port = port
+        self._host, self._port = host, port  # a numeric address after connecting
         self._socket: socket.socket | None = None
-        self.peer_host = host
-        """Numeric address of the peer after connecting; before that, ``host``."""
 
     def open(self, *, boot: bool = True) -> None:
         """Connect, see :meth:`StreamLink.open`."""
         self.close()
-        made, self.peer_host = _connected((self.peer_host, self._port), self.timeout_s)
+        made, self._host = _connected((self._host, self._port), self.timeout_s)
         self._socket = made
         self._use(made.fileno())  # with its time-out set, Python keeps it non-blocking
         if boot:

@@ -18,7 +18,6 @@ from hilctl_drivers.labjack.modbus_stream import (
     stream_time,
 )
 from hilctl_drivers.labjack.stream import VALUES_MAX
-from hilctl_drivers.modbus.config import session_at
 from hilctl_drivers.modbus.pdu import WriteFrame
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
@@ -47,7 +46,7 @@ class DrivenStream:
         self._log = log
         self.device = ModbusStream(
             chosen,
-            connect=lambda peer: session_at(peer, emulated.link),
+            link=emulated.link,
             sleep=emulated.time.sleep,
             clock=emulated.time,
         )
@@ -379,12 +378,12 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
 ):
     """Each alone is not: a running stream writes over the output with its next scan."""
     device = driven().device
-    device._write = lambda session, data: None
+    device._write = lambda data: None
     encoded = device._setup.output.format.encode(held_v)
     answer = SimpleNamespace(call=lambda frames: [stream.u32(running), encoded])
     monkeypatch.setattr("hilctl_drivers.labjack.modbus_stream.ModbusFeedback", lambda *_: answer)
     with nullcontext() if holds else pytest.raises(DeviceError):
-        device._confirm(SimpleNamespace(link=None, unit=1), 1.0)
+        device._confirm(1.0)
 
 
 @pytest.mark.parametrize(("changes", "text"), [

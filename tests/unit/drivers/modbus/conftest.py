@@ -9,7 +9,7 @@ import pytest
 
 from hilctl_drivers.emulator.factory import Emulator
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.modbus.config import ModbusOptions, session_at
+from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.profile import shipped_profiles
 from tests.fakes import FaultyLink, InProcess, ManualClock, emulated, logged
@@ -102,7 +102,7 @@ class DrivenModbus:
     def another(self, **changes):
         """Return a device on the same emulated one, with other options."""
         options = ModbusOptions.model_validate({**self._options, **changes})
-        return ModbusDac(options, lambda peer: session_at(peer, self.link))
+        return ModbusDac(options, self.link)
 
     def open(self):
         """Open and arm it, as a run does."""

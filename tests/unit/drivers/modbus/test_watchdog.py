@@ -1,10 +1,12 @@
 """The host watchdog of a Modbus device: what feeds it, and what opens a device that has tripped."""
 
+import socket
+
 import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.modbus.config import ModbusOptions, session_at
+from hilctl_drivers.modbus.config import ModbusOptions
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from tests.fakes import emulated, made_safe
 from tests.unit.drivers.modbus.conftest import MESSAGE_S, RATE_HZ, exchange
@@ -225,8 +227,8 @@ def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
         made.exchange(4.0)
     write = made.device._write
 
-    def written_over(session, data):
-        write(session, data)
+    def written_over(data):
+        write(data)
         made.time.sleep(late_s)
 
     made.device._write = written_over
@@ -243,25 +245,26 @@ def test_a_step_of_the_output_is_no_other_value(driven):
         output = device._setup.output
         step = output.step or 1e-6 * (output.max - output.min)
         assert step > 0.0
-        device._write = lambda session, data: None
-        device._held = lambda session, found=step: found
-        device._confirm(None, 0.0)
+        device._write = lambda data: None
+        device._held = lambda found=step: found
+        device._confirm(0.0)
         with pytest.raises(DeviceError):
-            device._confirm(None, -0.01 * step)
+            device._confirm(-0.01 * step)
 
 
-def test_no_name_is_looked_up_for_it():
+def test_no_name_is_looked_up_for_it(monkeypatch):
     with emulated(EmulatorOptions("generic_float32")) as served:
-        hosts = []
+        hosts, connect = [], socket.create_connection
 
-        def connect(peer):
-            hosts.append(peer.host)
-            return session_at(peer)
+        def connected(address, timeout_s):
+            hosts.append(address[0])
+            return connect(address, timeout_s)
 
+        monkeypatch.setattr(socket, "create_connection", connected)
         options = ModbusOptions.model_validate(
             {**served.options, "host": "localhost", "timeout_s": 20.0}
         )
-        device = ModbusDac(options, connect)
+        device = ModbusDac(options)
         device.open(RATE_HZ, 1)
         device.make_safe(0.0)
         assert hosts == ["localhost", "127.0.0.1"]

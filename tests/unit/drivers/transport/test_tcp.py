@@ -94,9 +94,9 @@ def test_tcp_kernel_sends_at_once_and_gives_up_in_time(serve):
 
 def test_tcp_address_of_the_peer_is_known_once_it_was_reached(serve):
     link = TcpLink("localhost", serve(lambda connection: None), PATIENT_S)
-    assert link.peer_host == "localhost"
+    assert link._host == "localhost"
     link.open()
-    assert link.peer_host == "127.0.0.1"
+    assert link._host == "127.0.0.1"
     link.close()
 
 
