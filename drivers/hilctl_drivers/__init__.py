@@ -15,6 +15,5 @@ ascii/  board/              text or fixed frames, and boards, for ``serial_dac``
 sensor_stream/              sensors that send unasked
 simulated/  emulator/       simulated rigs, and the same rigs behind real wires
 
-A protocol folder holds profiles, messages, a session and a device. Its ``LINK_KINDS`` registers its
-profiles.
+A protocol folder holds profiles, messages, a session and a device.
 """

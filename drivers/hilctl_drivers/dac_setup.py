@@ -24,6 +24,7 @@ from hilctl_drivers.signal_chain import (
 )
 from hilctl_drivers.transport.links import Link, naming
 from hilctl_drivers.transport.safe_exchange import SafeExchange
+from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 
@@ -311,10 +312,14 @@ class WiredDac(DacDevice):
 
     def _put_out(self, command: float) -> None:
         # No self-test, no init steps, no reader: none of them may cost the safe value.
-        value = self._chain.output(command)
-        self._safe_exchange.attempt(
-            self._link, lambda: self._send(value), lambda: self._confirm(value)
-        )
+        value, link = self._chain.output(command), self._link
+        if isinstance(link, StreamLink):
+            self._safe_exchange.attempt(
+                link, lambda: self._send(value), lambda: self._confirm(value)
+            )
+        else:
+            link.open()  # a new connection: no answer to an older command can come on it
+            self._confirm(value)
 
     @abstractmethod
     def _held(self) -> float | None:

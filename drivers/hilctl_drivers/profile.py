@@ -6,10 +6,8 @@ named by its path.
 
 import json
 from dataclasses import dataclass
-from functools import cache
-from importlib import import_module
 from pathlib import Path
-from pkgutil import iter_modules, resolve_name
+from pkgutil import resolve_name
 from typing import Annotated, Any, TypeAlias, TypeVar, cast
 
 from pydantic import PlainSerializer, PlainValidator, ValidationError
@@ -22,6 +20,17 @@ from hilctl.base.yaml import Document, broken_rules, loc_of, option_file
 from hilctl_drivers.profile_base import BaseProfile
 
 FOLDER = Path(__file__).parent / "profiles"
+LINK_KINDS = {
+    "ascii": "ascii.ascii_profile:AsciiProfile",
+    "ascii_tcp": "ascii.ascii_profile:AsciiProfile",
+    "bytes": "ascii.ascii_profile:AsciiProfile",
+    "frames": "board.board_profile:FrameProfile",
+    "rtu": "modbus.modbus_profile:ModbusProfile",
+    "rtu_tcp": "modbus.modbus_profile:ModbusProfile",
+    "sensor_stream": "sensor_stream.stream_profile:StreamProfile",
+    "tcp": "modbus.modbus_profile:ModbusProfile",
+}
+"""Class of profiles per ``link.kind``; imported when it is needed."""
 _Profile = TypeVar("_Profile", bound=BaseProfile)
 
 
@@ -34,20 +43,9 @@ class NamedProfile:
     text: str
 
 
-@cache
-def link_kinds() -> dict[str, str]:
-    """Return the class of profiles as ``module:name`` per ``link.kind``, of all protocols."""
-    here = __name__.rpartition(".")[0]
-    folders = [each.name for each in iter_modules([str(Path(__file__).parent)]) if each.ispkg]
-    kinds: dict[str, str] = {}
-    for name in folders:
-        kinds |= getattr(import_module(f"{here}.{name}"), "LINK_KINDS", {})
-    return dict(sorted(kinds.items()))
-
-
 def profile_class(kind: str) -> type[BaseProfile]:
     """Return the class of profiles with this ``link.kind``."""
-    return cast("type[BaseProfile]", resolve_name(link_kinds()[kind]))
+    return cast("type[BaseProfile]", resolve_name(f"hilctl_drivers.{LINK_KINDS[kind]}"))
 
 
 def shipped_profiles() -> dict[str, Path]:
@@ -101,8 +99,8 @@ def parse_profile(text: str, where: str) -> BaseProfile:
     document = Document(where, text)
     link = document.data.get("link")
     kind = link.get("kind") if isinstance(link, dict) else None
-    if not isinstance(kind, str) or kind not in link_kinds():
-        rule = f"must be one of {', '.join(link_kinds())}"
+    if not isinstance(kind, str) or kind not in LINK_KINDS:
+        rule = f"must be one of {', '.join(LINK_KINDS)}"
         value = "nothing" if kind is None else repr(kind)
         place = document.where(("link", "kind"))
         raise ConfigError([ConfigProblem(place, "link.kind", rule, value)])
@@ -158,7 +156,7 @@ def check_baud(profile: BaseProfile, baud: int) -> None:
 
 def profile_schema_text() -> str:
     """Return the JSON schema of profiles, as the text of ``profiles/schema.json``."""
-    models = list(dict.fromkeys(map(profile_class, link_kinds())))
+    models = list(dict.fromkeys(map(profile_class, LINK_KINDS)))
     refs, schema = models_json_schema([(model, "validation") for model in models])
     whole = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",

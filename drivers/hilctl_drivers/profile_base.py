@@ -11,6 +11,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
 from hilctl.base.table import known_unit
 from hilctl_drivers.transport.serial_port import SerialSettings
+from hilctl_drivers.transport.wire_time import WireTime
 
 
 class LinkSettings(StrictModel):
@@ -301,6 +302,22 @@ class BaseProfile(StrictModel):
     def title(self) -> str:
         """Vendor and model."""
         return f"{self.vendor} {self.model}"
+
+    def wire_time(
+        self, what: str, sent: int, received: int, gaps: int, replies: int, settle_s: float
+    ) -> WireTime:
+        """Return the time of characters sent and received, of gaps, and of devices to answer."""
+        link = self.link
+        gaps = gaps if link.silence_s else 0
+        return WireTime(
+            f"{what} {link.medium}",
+            sent * link.char_s,
+            received * link.char_s,
+            gaps,
+            gaps * link.silence_s,
+            replies * self.turnaround_s,
+            settle_s=settle_s,
+        )
 
     def provenance(self, prefix: str = "") -> dict[str, str]:
         """Return device and sources of the profile, to keep with a recording."""

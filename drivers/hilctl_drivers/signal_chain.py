@@ -338,6 +338,7 @@ class SignalChain:
             raise InputError(
                 f"amplifier takes {amplifier.output_unit}, but the output is in {output.unit}"
             )
+        self.amplifier, self.sensor, self.input = amplifier, sensor, sensor_input
         self.command_unit: CommandUnit = "A" if amplifier is None else amplifier.command_unit
         self._output_unit = output.unit
         self._gain = 1.0 if amplifier is None else amplifier.gain
@@ -461,17 +462,6 @@ def check_watchdog(
         raise InputError(
             f"watchdog.safe_command must be {low:g} to {high:g}, got {wanted.safe_command:g}"
         )
-    _check_protects(title, name, has)
-    at_zero, unit = chain.command(0.0), chain.command_unit
-    if has.on_trip in {"zero", "reset"} and abs(at_zero - wanted.safe_command) > 1e-9:
-        raise InputError(
-            f"the watchdog of {title} puts {name} at 0 {output.unit}, which is {at_zero:g} "
-            f"{unit} here: watchdog.safe_command must be that, got {wanted.safe_command:g}"
-        )
-
-
-def _check_protects(title: str, name: str, has: Watchdog) -> None:
-    """Reject a watchdog whose trip does not change the output."""
     safe = getattr(has, "safe", {})
     if has.on_trip == "hold":
         raise InputError(
@@ -482,4 +472,10 @@ def _check_protects(title: str, name: str, has: Watchdog) -> None:
         raise InputError(
             f"the watchdog of {title} does nothing for {name}, only for "
             f"{', '.join(safe)}: take one of these, or say watchdog: none"
+        )
+    at_zero, unit = chain.command(0.0), chain.command_unit
+    if has.on_trip in {"zero", "reset"} and abs(at_zero - wanted.safe_command) > 1e-9:
+        raise InputError(
+            f"the watchdog of {title} puts {name} at 0 {output.unit}, which is {at_zero:g} "
+            f"{unit} here: watchdog.safe_command must be that, got {wanted.safe_command:g}"
         )

@@ -10,7 +10,7 @@ from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.modbus.pdu import read_pdu, rtu_adu, write_single_pdu
 from hilctl_drivers.modbus.register_map import EnsureStep, RegisterStep
-from hilctl_drivers.profile import FOLDER, link_kinds, load_profile, profile_class, shipped_profiles
+from hilctl_drivers.profile import FOLDER, LINK_KINDS, load_profile, profile_class, shipped_profiles
 
 NAMES = (
     "acromag_962en", "adam_4024", "adam_4024_ascii", "adam_4117", "adam_6024", "adam_6217",
@@ -142,7 +142,7 @@ def test_schema_line(name):
 def test_round_trip(profiles, name):
     profile = profiles[name]
     assert type(profile).model_validate(profile.model_dump()) == profile
-    assert type(profile) in {profile_class(kind) for kind in link_kinds()}
+    assert type(profile) in {profile_class(kind) for kind in LINK_KINDS}
 
 
 def test_provenance(profiles, name):

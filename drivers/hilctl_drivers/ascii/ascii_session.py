@@ -478,21 +478,13 @@ def _question(profile: AsciiProfile, query: Query) -> _Line:
 
 def _lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float = 0.0) -> WireTime:
     """Return the time of lines with their replies, one after the other."""
-    link = profile.link
-    requests, answers = formats(link)
+    requests, answers = formats(profile.link)
     replies = [reply for _, reply in lines if reply is not None]
     sent = sum(requests.size(text) for text, _ in lines)
     received = sum(map(answers.size, replies))
     count = sum(_lines(text) for text, _ in lines)
-    return WireTime(
-        f"{count} {requests.NAME}{'' if count == 1 else 's'} {link.medium}",
-        sent * link.char_s,
-        received * link.char_s,
-        len(lines) if link.silence_s else 0,
-        len(lines) * link.silence_s,
-        len(replies) * profile.turnaround_s,
-        settle_s=settle_s,
-    )
+    what = f"{count} {requests.NAME}{'' if count == 1 else 's'}"
+    return profile.wire_time(what, sent, received, len(lines), len(replies), settle_s)
 
 
 def _steps_time(

@@ -27,6 +27,12 @@ class FramesLink(BinaryLineSettings):
         default=1e-3, gt=0.0, description="time between USB frames, s: 1 ms full, 125 us high speed"
     )
 
+    @model_validator(mode="after")
+    def _finds_the_next_frame(self) -> Self:
+        if (self.framing, self.crc) == ("length", "none"):
+            raise ValueError("crc must not be none with framing: length")
+        return self
+
 
 class FrameChannel(Range):
     """A DAC or ADC of a board: encoding of its values in a message."""

@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any, cast
+from typing import Annotated, Any
 
 import typer
 
@@ -166,7 +166,7 @@ def emulate(
         ),
     ],
     link: Annotated[
-        str | None, typer.Option(help="tcp, rtu or rtu_tcp; default: from the profile.")
+        LinkKind | None, typer.Option(help="Link of the device; default: from the profile.")
     ] = None,
     host: Annotated[str, typer.Option(help="Address to listen on.")] = EmulatorOptions.host,
     port: Annotated[
@@ -185,10 +185,8 @@ def emulate(
         str | None, typer.Option(help="Profile of the device with the input, if separate.")
     ] = None,
     reader_line: Annotated[
-        str | None,
-        typer.Option(
-            help="Line of the reader: same or own; default: same for two Modbus RTU, otherwise own."
-        ),
+        ReaderLine | None,
+        typer.Option(help="Line of the reader; default: same for two Modbus RTU, otherwise own."),
     ] = None,
     reader_unit_id: Annotated[int | None, typer.Option(help="Unit id of the reader.")] = None,
     reader_port: Annotated[
@@ -233,7 +231,7 @@ def emulate(
         reader, _, sensor = sensor.rpartition(":")
     options = EmulatorOptions(
         profile=profile,
-        link=cast(LinkKind | None, link),
+        link=link,
         host=host,
         port=port,
         log=log,
@@ -241,7 +239,7 @@ def emulate(
         output=output,
         sensor=sensor,
         reader=reader,
-        reader_line=cast(ReaderLine | None, reader_line),
+        reader_line=reader_line,
         reader_unit_id=reader_unit_id,
         reader_port=reader_port,
         actuator=_actuator(unit or "A", actuator or ()),

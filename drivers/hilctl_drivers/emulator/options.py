@@ -115,10 +115,3 @@ class EmulatorOptions:
     # Amplifier and sensor; spread over the channels' ranges if None.
     wiring: tuple[Amplifier | None, Sensor] | None = None
     command: float | None = None  # initial command, as if it was the power-up value
-
-    def __post_init__(self) -> None:
-        kinds = {"link": LinkKind, "reader_link": LinkKind, "reader_line": ReaderLine}
-        for name, words in kinds.items():
-            given, known = getattr(self, name), get_args(words)
-            if given is not None and given not in known:
-                raise InputError(f"{name} must be one of {', '.join(known)}, got {given!r}")

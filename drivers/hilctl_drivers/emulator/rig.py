@@ -78,18 +78,11 @@ class Rig:
 class SimulatedWiring(SignalChain):
     """Amplifier and sensor between the device's terminals and the rig."""
 
-    def __init__(
-        self, output: Range, sensor_input: Range, amplifier: Amplifier | None, sensor: Sensor
-    ) -> None:
-        super().__init__(output, sensor_input, amplifier, sensor)
-        self.amplifier, self.sensor = amplifier, sensor
-        self._input_limits = sensor_input.limits
-
     def at_terminal(self, displacement_um: F64 | float) -> F64:
         """Return the sensor's signal, clipped to the input's range as by an ADC."""
         *_, um_per_unit, offset_um = self.factors
         signal = (displacement_um - offset_um) / um_per_unit
-        clipped: F64 = np.clip(signal, *self._input_limits)
+        clipped: F64 = np.clip(signal, *self.input.limits)
         return clipped
 
     @classmethod

@@ -7,6 +7,3 @@ watchdog.py           host watchdog and safe value
 modbus_session.py     session, exchange times, prepared requests
 pdu.py                messages
 """
-
-LINK_KINDS = dict.fromkeys(("tcp", "rtu", "rtu_tcp"), f"{__name__}.modbus_profile:ModbusProfile")
-"""Class of profiles per ``link.kind``."""

@@ -457,20 +457,10 @@ def _requests_time(
 ) -> WireTime:
     """Return the time of request PDUs and their replies, one after the other."""
     what = "+".join(f"FC{pdu[0]:02d}" for pdu in requests)
-    turnaround_s = len(requests) * profile.turnaround_s
-    link = profile.link
     sent = sum(len(rtu_adu(1, pdu)) for pdu in requests)
     received = sum(reply_size(pdu) + 3 for pdu in requests)  # unit and CRC
-    gaps = 2 * len(requests) if link.silence_s else 0
-    return WireTime(
-        f"{what} {link.medium}",
-        sent * link.char_s,
-        received * link.char_s,
-        gaps,
-        gaps * link.silence_s,
-        turnaround_s,
-        settle_s=settle_s,
-    )
+    count = len(requests)
+    return profile.wire_time(what, sent, received, 2 * count, count, settle_s)
 
 
 def _step_requests(profile: ModbusProfile, step: ModbusStep) -> list[bytes]:

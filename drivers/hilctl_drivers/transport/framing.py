@@ -164,12 +164,6 @@ class LengthFraming(Framing):
     protocol needs.
     """
 
-    def __post_init__(self) -> None:
-        if not 1 <= self.payload_max <= 0xFFFF:
-            raise BadRequestError(f"payload_max must be 1 to 65535, got {self.payload_max}")
-        if not self.crc.size:
-            raise BadRequestError("length-prefixed frames need a CRC: name one, or use COBS")
-
     def _frame(self, payload: bytes) -> bytes:
         body = len(payload).to_bytes(LENGTH_SIZE, "little") + payload
         return body + self.crc.of(body)

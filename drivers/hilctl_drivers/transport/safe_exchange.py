@@ -9,7 +9,6 @@ from collections.abc import Callable
 
 from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl_drivers.profile_base import Range
-from hilctl_drivers.transport.links import Link
 from hilctl_drivers.transport.stream_link import StreamLink
 
 _QUIET_S = 0.05
@@ -28,18 +27,16 @@ class SafeExchange:
     def __init__(self) -> None:
         self._quiet_s = _QUIET_S
 
-    def attempt(self, link: Link, send: Callable[[], None], confirm: Callable[[], None]) -> None:
+    def attempt(
+        self, link: StreamLink, send: Callable[[], None], confirm: Callable[[], None]
+    ) -> None:
         """Send the value and have it confirmed, once.
 
         Args:
             link: To the device, open or not; a board that opening resets is not waited for.
-            send: Sends the value and awaits no answer; only on a stream.
+            send: Sends the value and awaits no answer.
             confirm: Sends it, and raises unless the device confirms it.
         """
-        if not isinstance(link, StreamLink):
-            link.open()  # no answer to an older message can come on a new connection
-            confirm()
-            return
         try:
             if not link.is_open:
                 link.open(boot=False)

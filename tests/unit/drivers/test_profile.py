@@ -204,6 +204,7 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("board", {"streaming": None}, "streaming and exchange: stream go together"),
     ("board", {"streaming.fifo_depth": 100}, "streaming.block_max must be <= streaming.fifo_depth"),
     ("board", {"link.payload_max": 1000}, "streaming.block_max samples need"),
+    ("board", {"link.framing": "length", "link.crc": "none"}, "link: crc must not be none"),
     ("board", {"link.crc": "crc8"}, "link.crc: must be one of 'crc16_modbus'"),
     ("board", {"outputs.DAC.type": "int16", "outputs.DAC.order": "BA", "outputs.DAC.scale": 1e-5},
      "min and max must be inside what int16 holds"),

@@ -16,7 +16,7 @@ from hilctl.base.yaml import Document
 from hilctl.experiment import devices as registry
 from hilctl.experiment.devices import describe, inventory, made_device
 from hilctl.experiment.file import schema_text
-from hilctl_drivers.profile import link_kinds
+from hilctl_drivers.profile import LINK_KINDS
 
 
 def made(text, folder):
@@ -265,4 +265,4 @@ class TestSchema:
 
 
 def test_every_link_has_a_name():
-    assert set(registry._PROTOCOLS) == set(link_kinds())
+    assert set(registry._PROTOCOLS) == set(LINK_KINDS)

@@ -121,17 +121,6 @@ def test_payloads_that_do_not_fit_are_refused(framing, size):
         framing.encode(bytes(size))
 
 
-@pytest.mark.parametrize(("kind", "crc", "size", "text"), [
-    ("length", "crc32", 0, "payload_max .*got 0$"),
-    ("length", "crc32", 65536, "payload_max .*got 65536$"),
-    ("length", "none", 100, "need a CRC"),
-])  # fmt: skip
-def test_framings_that_cannot_be_are_refused(kind, crc, size, text):
-    """Without a check nothing would tell the beginning of a length-prefixed frame."""
-    with pytest.raises(BadRequestError, match=text):
-        binary_framing(kind, crc, size)
-
-
 @pytest.mark.parametrize("size", [1, 65535])
 def test_length_frames_of_the_extreme_sizes(size):
     framing = LengthFraming(CRCS["crc32"], size)
