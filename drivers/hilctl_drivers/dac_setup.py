@@ -290,14 +290,77 @@ class SessionReader(SensorReader):
         self._session.run(self._session.profile.close)
 
 
-class WiredDac(DacDevice):
-    """A DAC on a link, with the session that reads its sensor; its errors name its place."""
+_PROMPT_S = 0.2
+"""A longer delay of the safe value is mentioned in ``safe_note``."""
 
-    def __init__(self, setup: DacSetup, info: DeviceInfo, action: str, link: Link) -> None:
-        writer, output = setup.writer, setup.options.output
-        super().__init__(info, f"{info.name} {writer.name} at {writer.place}", action, output)
-        self._setup, self._chain, self._link = setup, setup.chain, link
+
+class WiredDac(DacDevice):
+    """A DAC with a profile, on a link, and the session that reads its sensor.
+
+    Attributes:
+        KIND: Its kind in experiments.
+        ACTION: An exchange in messages.
+    """
+
+    KIND: ClassVar[str]
+    ACTION: ClassVar[str] = "write {output}, read {input}"
+    block_max = 1  # samples of one exchange
+    fifo_depth = 0  # samples; 0 without a FIFO
+    measures = False  # whether exchanges fill ``measured``
+    longest_message_s = 0.0  # longest delay of the safe value by a running exchange
+    arm_s = 0.0  # longest time to arm the watchdog
+    unconfirmed = ""  # why a written value cannot be confirmed; empty if it can
+
+    def __init__(self, options: Any, link: Link | None = None) -> None:
+        """Describe the device, on a new link or the given one; nothing is sent before :meth:`open`.
+
+        Raises:
+            InputError: The profile cannot be used, or the options do not fit it.
+        """
+        self._options = options
+        self._setup = setup = DacSetup.of(options)
+        self._chain = setup.chain
+        self._link = link or setup.writer.link()
         self._safe_exchange = SafeExchange()
+        self._prepare()
+        title = f"{self.KIND} {setup.writer.name} at {setup.writer.place}"
+        action = self.ACTION.format(output=options.output, input=options.input)
+        super().__init__(self._describe(), title, action, options.output)
+
+    @abstractmethod
+    def _prepare(self) -> None:
+        """Set the attributes of the class; raise InputError if an option is not supported."""
+
+    def _describe(self) -> DeviceInfo:
+        options, streams = self._options, self.fifo_depth > 0
+        details = {}
+        if streams:
+            details["fifo_depth"] = f"{self.fifo_depth} samples"
+            details["fifo_level"] = f"{options.fifo_blocks} blocks"
+        return self._setup.info(
+            self.KIND,
+            self._rates(self.block_max),
+            buffered=streams,
+            fifo_depth=self.fifo_depth,
+            latency_blocks=options.fifo_blocks if streams else 0,
+            measures_command=self.measures,
+            arm_s=0.0 if options.watchdog == "none" else self.arm_s,
+            safe_note="; ".join(filter(None, (self._late_note(), self.unconfirmed))),
+            confirms=not self.unconfirmed,
+            details=details,
+        )
+
+    def _late_note(self) -> str:
+        if self.longest_message_s <= _PROMPT_S:
+            return ""
+        timeout_s = self._options.watchdog_timeout_s
+        behind = "no watchdog of the device stands behind it"
+        if timeout_s is not None:
+            behind = f"the device's watchdog acts after {timeout_s:g} s"
+        return f"a message takes up to {self.longest_message_s:.2g} s on this line; {behind}"
+
+    def _longest_block(self) -> tuple[int, str]:
+        return self.block_max, ""
 
     def _output(self) -> float | None:
         held = self._held()

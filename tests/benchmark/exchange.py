@@ -21,8 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl_drivers.modbus.config import ModbusOptions
-from hilctl_drivers.modbus.modbus_dac import ModbusDac
+from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 
 SOURCE = Path(__file__).with_suffix(".c")
 WARM_UP = 200

@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.modbus.config import ModbusOptions
-from hilctl_drivers.modbus.modbus_dac import ModbusDac
+from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 from tests.peers.conftest import read_line, running, serial_cable
 
 HERE = Path(__file__).parent

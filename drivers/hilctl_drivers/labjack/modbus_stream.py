@@ -9,7 +9,7 @@ which is the longest stall of this machine. The first sample is output once that
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import ClassVar
+from typing import ClassVar, cast
 
 import numpy as np
 import numpy.typing as npt
@@ -27,9 +27,8 @@ from hilctl_drivers.labjack.stream import (
     f32,
     u32,
 )
-from hilctl_drivers.modbus.config import ModbusSetup
 from hilctl_drivers.modbus.modbus_dac import ModbusDevice
-from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusProfile
+from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusInput, ModbusProfile
 from hilctl_drivers.modbus.pdu import FeedbackFrame, ReadFrame, WriteFrame
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks
 from hilctl_drivers.transport.links import Link, RefusedError
@@ -221,39 +220,13 @@ class ModbusStreamOptions(DacOptions):
     fifo_blocks: FifoBlocks = 8
 
 
-def _checked_streaming(setup: ModbusSetup) -> LabJackStreaming:
-    """Return how the device streams; raise InputError if it cannot with these options."""
-    options, profile = setup.options, setup.profile
-    streaming = profile.streaming
-    if streaming == "none":
-        raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
-    if setup.reads_elsewhere:
-        raise InputError("reader must be omitted: input and output are in one scan list")
-    for what, name, known in (
-        ("output", options.output, streaming.outputs),
-        ("input", options.input, streaming.inputs),
-    ):
-        if name not in known:
-            rule = f"{what} must be one that {profile.title} can stream, {', '.join(known)}"
-            raise InputError(f"{rule}, got {name!r}")
-    return streaming
-
-
-def _rates(setup: ModbusSetup, streaming: LabJackStreaming, block: int) -> RateLimit:
-    """Return the sample rates that the device can keep with that block."""
-    per_s, settle_s = streaming.samples_per_s_max, setup.output.settle_s
-    most_hz = streaming.rate_max_hz
-    whose = f"{per_s:g} samples a second for an input and an output: its profile"
-    if settle_s * most_hz > 1.0:
-        most_hz, whose = 1.0 / settle_s, f"settling {settle_s * 1e3:.2f} ms: its profile"
-    wire = stream_time(setup.profile, block)
-    return RateLimit.of(wire, most_hz, whose, streaming.rate_min_hz)
-
-
 class ModbusStream(ModbusDevice):
     """A :class:`~hilctl.base.device.Device` that streams over Modbus TCP."""
 
     Options: ClassVar[type[DeviceOptions]] = ModbusStreamOptions
+
+    KIND = "modbus_stream"
+    ACTION = "stream {output} and {input}"
 
     def __init__(
         self,
@@ -262,32 +235,31 @@ class ModbusStream(ModbusDevice):
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """Describe the device, on a new link or the given one; nothing is sent before :meth:`open`.
-
-        Raises:
-            InputError: The profile cannot be used, or the options do not fit it.
-        """
-        setup = ModbusSetup.of(options)
-        self._streaming = streaming = _checked_streaming(setup)
-        self._fifo_blocks = options.fifo_blocks
-        self._block_max = max(1, streaming.fifo_depth // (options.fifo_blocks + 1))
-        info = setup.described(
-            "modbus_stream",
-            _rates(setup, streaming, self._block_max),
-            buffered=True,
-            fifo_depth=streaming.fifo_depth,
-            latency_blocks=options.fifo_blocks,
-            details={
-                "fifo_depth": f"{streaming.fifo_depth} samples",
-                "fifo_level": f"{options.fifo_blocks} blocks",
-            },
-        )
-        action = f"stream {options.output} and {options.input}"
-        super().__init__(setup, info, action, link)
+        """See :class:`~hilctl_drivers.dac_setup.WiredDac`."""
+        super().__init__(options, link)
         self._sleep, self._clock = sleep, clock
         self._stream: StreamSession | None = None
         self._calibration: InputCalibration | None = None
         self._next_sample = 0
+
+    def _prepare(self) -> None:
+        super()._prepare()
+        options, profile = self._options, self._profile
+        streaming = profile.streaming
+        if streaming == "none":
+            raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
+        if self._setup.reads_elsewhere:
+            raise InputError("reader must be omitted: input and output are in one scan list")
+        for what, name, known in (
+            ("output", options.output, streaming.outputs),
+            ("input", options.input, streaming.inputs),
+        ):
+            if name not in known:
+                rule = f"{what} must be one that {profile.title} can stream, {', '.join(known)}"
+                raise InputError(f"{rule}, got {name!r}")
+        self._streaming = streaming
+        self.fifo_depth = streaming.fifo_depth
+        self.block_max = max(1, streaming.fifo_depth // (options.fifo_blocks + 1))
 
     @property
     def stream(self) -> StreamSession | None:
@@ -295,18 +267,24 @@ class ModbusStream(ModbusDevice):
         return self._stream
 
     def _longest_block(self) -> tuple[int, str]:
-        depth = self._streaming.fifo_depth
-        return self._block_max, f": fifo_blocks + 1 of them must fit into the FIFO, {depth} samples"
+        why = f": fifo_blocks + 1 of them must fit into the FIFO, {self.fifo_depth} samples"
+        return self.block_max, why
 
     def _rates(self, block: int) -> RateLimit:
-        return _rates(self._setup, self._streaming, block)
+        streaming, settle_s = self._streaming, self._target.settle_s
+        most_hz, per_s = streaming.rate_max_hz, streaming.samples_per_s_max
+        whose = f"{per_s:g} samples a second for an input and an output: its profile"
+        if settle_s * most_hz > 1.0:
+            most_hz, whose = 1.0 / settle_s, f"settling {settle_s * 1e3:.2f} ms: its profile"
+        wire = stream_time(self._profile, block)
+        return RateLimit.of(wire, most_hz, whose, streaming.rate_min_hz)
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Self-test, init steps, calibration, buffers and clock; see :class:`DacDevice`.
 
         The output does not move before enough blocks have come.
         """
-        setup, streaming = self._setup, self._streaming
+        profile, streaming = self._profile, self._streaming
         self._guard.plan(sample_rate_hz / block)
         self._connect()
         writer = self._writer
@@ -314,18 +292,18 @@ class ModbusStream(ModbusDevice):
         stream = StreamSession(
             ModbusFeedback(self._link, writer.unit),
             streaming,
-            setup.options.timeout_s,
-            setup.profile.turnaround_s,
+            self._options.timeout_s,
+            profile.turnaround_s,
             self._sleep,
             self._clock,
         )
         stream.stop()  # also one of another program: a running stream accepts no settings
-        writer.run(writer.profile.init)
+        writer.run(profile.init)
         writer.run(streaming.setup)
-        source = setup.profile.wire_address(setup.input)
+        source = profile.wire_address(cast(ModbusInput, self._setup.input))
         self._calibration = stream.calibration(source // 2)
-        stream.prepare(sample_rate_hz, setup.profile.wire_address(setup.output), source)
-        check_fifo(block, self._fifo_blocks, stream.capacity)
+        stream.prepare(sample_rate_hz, profile.wire_address(self._target), source)
+        check_fifo(block, self._options.fifo_blocks, stream.capacity)
         self._try_out_safe_value()
         self._stream = stream
         self._next_sample = 0
@@ -351,7 +329,7 @@ class ModbusStream(ModbusDevice):
 
     def _readings(self, stream: StreamSession, block: int) -> F64 | None:
         """Return a block's volts, float64[B]; None before the first one is due."""
-        kept = self._fifo_blocks * block
+        kept = self._options.fifo_blocks * block
         if self._next_sample < kept:
             return None
         if self._next_sample == kept:
@@ -362,7 +340,7 @@ class ModbusStream(ModbusDevice):
 
     def _write(self, data: bytes) -> None:
         feedback = ModbusFeedback(self._link, self._writer.unit)
-        write = WriteFrame(self._setup.profile.wire_address(self._setup.output), data)
+        write = WriteFrame(self._profile.wire_address(self._target), data)
         # The stream first: it would write over the safe value with its next scan.
         try:
             feedback.call([WriteFrame(ENABLE, u32(0)), write])
@@ -370,8 +348,8 @@ class ModbusStream(ModbusDevice):
             feedback.call([write])
 
     def _read_back(self) -> float:
-        output = self._setup.output
-        target = ReadFrame(self._setup.profile.wire_address(output), output.words)
+        output = self._target
+        target = ReadFrame(self._profile.wire_address(output), output.words)
         frames = [ReadFrame(ENABLE, 2), target]
         running, held = ModbusFeedback(self._link, self._writer.unit).call(frames)
         if running != u32(0):

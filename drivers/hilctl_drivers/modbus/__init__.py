@@ -1,7 +1,6 @@
 """DACs over Modbus TCP and RTU, one sample per exchange.
 
 modbus_profile.py     profiles, including streaming; register_map.py has registers and steps
-config.py             options of an experiment, resolved against the profiles
 modbus_dac.py         the device
 watchdog.py           host watchdog and safe value
 modbus_session.py     session, exchange times, prepared requests

@@ -8,21 +8,31 @@ last reply.
 
 from collections.abc import Callable
 from dataclasses import replace
-from typing import ClassVar, TypeAlias
+from typing import ClassVar, TypeAlias, cast
 
 import numpy as np
 
-from hilctl.base.device import DeviceInfo, DeviceOptions
-from hilctl.base.errors import DeviceError, UnconfirmedError
+from hilctl.base.device import DeviceOptions
+from hilctl.base.errors import DeviceError, InputError, UnconfirmedError
 from hilctl.base.types import F64
 from hilctl_drivers.dac_setup import SensorReader, WiredDac
-from hilctl_drivers.modbus.config import ModbusOptions, ModbusSetup, session_at
-from hilctl_drivers.modbus.modbus_profile import ModbusInput
-from hilctl_drivers.modbus.modbus_session import combined_request, write_request
+from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusOutput, ModbusProfile
+from hilctl_drivers.modbus.modbus_session import (
+    arm_s,
+    combined_request,
+    exchange_time,
+    feed_time,
+    read_requests,
+    read_time,
+    session_at,
+    write_request,
+)
 from hilctl_drivers.modbus.watchdog import ModbusWatchdogDriver
+from hilctl_drivers.signal_chain import DacOptions, Measure
 from hilctl_drivers.transport.links import Link, NoAnswerError, RefusedError
 from hilctl_drivers.transport.safe_exchange import check_read_back, try_out
 from hilctl_drivers.transport.stream_link import StreamLink
+from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 Swap: TypeAlias = Callable[[bytes], float]
 """Write register bytes to the output and return the value of the input in its unit.
@@ -32,19 +42,56 @@ specification lets the device write first.
 """
 
 
+class ModbusOptions(DacOptions):
+    """Options of ``modbus_dac``."""
+
+    measure: Measure = None
+
+
 class ModbusDevice(WiredDac):
     """Session, watchdog and safe value of ``modbus_dac`` and ``modbus_stream``."""
 
-    _setup: ModbusSetup
     _reader: SensorReader
 
-    def __init__(
-        self, setup: ModbusSetup, info: DeviceInfo, action: str, link: Link | None
-    ) -> None:
-        self._writer = session_at(setup.writer, link)
-        super().__init__(setup, info, action, self._writer.link)
+    def __init__(self, options: DacOptions, link: Link | None = None) -> None:
+        """See :class:`~hilctl_drivers.dac_setup.WiredDac`."""
+        profile = options.profile.profile
+        if not isinstance(profile, ModbusProfile):
+            name = options.profile.name
+            raise InputError(f"profile {name} is one for kind: {profile.DEVICE}, not Modbus")
+        super().__init__(options, link)
+
+    def _prepare(self) -> None:
+        setup, options = self._setup, self._options
+        self._profile = cast(ModbusProfile, setup.writer.profile)
+        self._target = cast(ModbusOutput, setup.output)
+        self._writer = session_at(setup.writer, self._link)
         self._reader = setup.reader_on(self._link)
         self._guard = ModbusWatchdogDriver(setup)
+        self.measures = setup.measure is not None
+        self.arm_s = arm_s(self._profile, options.output)
+        readback = self._target.readback_register
+        if readback is None and self._target.function == 6 and setup.writer.framing == "rtu":
+            # The correct reply equals the request, and is what a line that echoes gives.
+            self.unconfirmed = (
+                "the device cannot confirm it: on a serial line the reply to function 6 may be an "
+                "echo, and the output cannot be read back"
+            )
+        # One transaction is tried at open. That moves an output that cannot be read back, so it is
+        # not tried there.
+        self._may_combine = (
+            self._profile.exchange != "none" and readback is not None and not setup.reads_elsewhere
+        )
+        setup.check_timeout(self._wire(self._may_combine))
+
+    def _wire(self, one_transaction: bool) -> WireTime:
+        """Return the time of a sample on the wire."""
+        setup, profile = self._setup, self._profile
+        own = None if setup.reads_elsewhere else setup.options.input
+        wire = exchange_time(profile, setup.options.output, own, one_transaction=one_transaction)
+        if setup.measure is not None:
+            wire = wire.then(read_time(profile, setup.measure).named("to measure the output"))
+        return setup.after_reading(wire)
 
     def _connect(self) -> None:
         """Connect and check that the devices are the right ones."""
@@ -56,7 +103,7 @@ class ModbusDevice(WiredDac):
         self._guard.arm(self._writer)
 
     def _held(self) -> float | None:
-        return self._writer.held(self._setup.output)
+        return self._writer.held(self._target)
 
     def _look(self) -> tuple[float, float | None]:
         setup, writer = self._setup, self._writer
@@ -77,16 +124,16 @@ class ModbusDevice(WiredDac):
 
     def _send(self, value: float) -> None:
         assert isinstance(self._link, StreamLink)
-        output = self._setup.output
+        output = self._target
         pdu = write_request(self._writer.profile, output, output.format.encode(value))
         self._link.send_now(self._writer.prepare(pdu).request())
 
     def _confirm(self, value: float) -> None:
-        output = self._setup.output
+        output = self._target
         data = output.format.encode(value)
         self._guard.write_through(self._writer, lambda: self._write(data))
-        if self._setup.unconfirmed:
-            raise UnconfirmedError(f"the value was sent, but {self._setup.unconfirmed}")
+        if self.unconfirmed:
+            raise UnconfirmedError(f"the value was sent, but {self.unconfirmed}")
         found = self._read_back()
         if found is not None:
             tolerance = max(output.step, 1e-6 * (output.max - output.min))
@@ -94,7 +141,7 @@ class ModbusDevice(WiredDac):
 
     def _try_out_safe_value(self) -> None:
         """Write the held value with the message of the safe value, see :func:`try_out`."""
-        output = self._setup.output
+        output = self._target
         data = self._writer.held_data(output)
         if data is not None:
             name = f"{self._setup.options.output}, register {output.address}"
@@ -102,7 +149,7 @@ class ModbusDevice(WiredDac):
 
     def _write(self, data: bytes) -> None:
         """Write the output's register bytes once."""
-        self._writer.write_bytes(self._setup.output, data)
+        self._writer.write_bytes(self._target, data)
 
     def _read_back(self) -> float | None:
         """Return the value of the output after a safe value; None if it cannot be known."""
@@ -120,31 +167,32 @@ class ModbusDac(ModbusDevice):
 
     Options: ClassVar[type[DeviceOptions]] = ModbusOptions
 
-    def __init__(self, options: ModbusOptions, link: Link | None = None) -> None:
-        """Describe the device, on a new link or the given one; nothing is sent before :meth:`open`.
+    KIND = "modbus_dac"
 
-        Raises:
-            InputError: The profile cannot be used, or the options do not fit it.
-        """
-        setup = ModbusSetup.of(options)
-        action = f"write {options.output}, read {options.input}"
-        info = setup.described("modbus_dac", setup.sample_rates(setup.may_combine))
-        super().__init__(setup, info, action, link)
-        self._factors = setup.chain.factors
-        self._encode = setup.output.format.encode
+    def _prepare(self) -> None:
+        super()._prepare()
+        self._factors = self._chain.factors
+        self._encode = self._target.format.encode
         self._swap: Swap = _not_open
         self._measure: Callable[[], float] | None = None
-        if setup.measure is not None:
-            self._measured_by = setup.chain.measured(setup.measure)
-        self.one_transaction = False
+        if self._setup.measure is not None:
+            self._measured_by = self._chain.measured(self._setup.measure)
+        self.one_transaction = self._may_combine
         """Whether a tick is one transaction; known after opening."""
+
+    def _rates(self, block: int) -> RateLimit:
+        """Return the rates with the present number of transactions."""
+        del block
+        wire = self._wire(self.one_transaction)
+        if self._options.watchdog != "none":
+            wire = wire.then(feed_time(self._profile))
+        return self._setup.rates(wire)
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Self-test, init steps, one reading of the input; see :class:`DacDevice`.
 
         Only a test shows whether the device exchanges in one transaction, and so its highest rate.
         """
-        del block
         writer = self._writer
         self._guard.plan(sample_rate_hz)
         self._connect()
@@ -155,13 +203,23 @@ class ModbusDac(ModbusDevice):
             self._reader.read()  # a missing address must show before the output moves
         swap, self.one_transaction = self._find_swap()
         self._try_out_safe_value()
-        rates = self._setup.sample_rates(self.one_transaction)
+        rates = self._rates(block)
         how = "one transaction" if self.one_transaction else "a read and a write"
         replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
         self._swap = self._checked(swap)
         if self._setup.measure is not None:
             self._measure = writer.input_reader(self._setup.measure)
-        self.transactions = self._setup.transactions(self.one_transaction)
+        self.transactions = self._transactions()
+
+    def _transactions(self) -> int:
+        """Return the number of requests of a sample."""
+        setup, count = self._setup, 1 if self.one_transaction else 2
+        if isinstance(setup.input, ModbusInput):
+            reader = cast(ModbusProfile, setup.reader.profile)
+            count += len(read_requests(reader, setup.input)) - 1
+        if setup.measure is not None:
+            count += len(read_requests(self._profile, setup.measure))
+        return count + (self._profile.error_register != "none")
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
@@ -186,7 +244,7 @@ class ModbusDac(ModbusDevice):
         """
         writer, reader = self._writer, self._reader
         swap = self._combined()
-        held = None if swap is None else writer.held_data(self._setup.output)
+        held = None if swap is None else writer.held_data(self._target)
         if swap is not None and held is not None:
             try:
                 swap(held)
@@ -195,7 +253,7 @@ class ModbusDac(ModbusDevice):
                 writer.link.open()
             except RefusedError:
                 pass
-        write = writer.prepare(write_request(writer.profile, self._setup.output))
+        write = writer.prepare(write_request(writer.profile, self._target))
 
         def pair(data: bytes) -> float:
             found = reader.read()
@@ -222,7 +280,7 @@ class ModbusDac(ModbusDevice):
         setup, writer = self._setup, self._writer
         if setup.reads_elsewhere or not isinstance(setup.input, ModbusInput):
             return None
-        pdu = combined_request(writer.profile, setup.output, setup.input)
+        pdu = combined_request(writer.profile, self._target, setup.input)
         if pdu is None:
             return None
         transaction, decode = writer.prepare(pdu), writer.decoder(setup.input)

@@ -220,7 +220,7 @@ class ModbusProfile(BaseProfile):
     """A Modbus device."""
 
     DEVICE: ClassVar[str] = "modbus_dac"
-    READER: ClassVar[str] = "hilctl_drivers.modbus.config:ModbusReader"
+    READER: ClassVar[str] = "hilctl_drivers.modbus.modbus_session:ModbusReader"
 
     link: Annotated[
         ModbusTcpLink | ModbusRtuTcpLink | ModbusRtuLink, Field(discriminator="kind")

@@ -13,6 +13,8 @@ from collections.abc import Callable, Sequence
 from typing import Literal, cast
 
 from hilctl.base.errors import DeviceError
+from hilctl_drivers.dac_setup import SessionReader
+from hilctl_drivers.endpoint import Endpoint
 from hilctl_drivers.modbus.modbus_profile import (
     ModbusInput,
     ModbusOutput,
@@ -229,10 +231,7 @@ def combined_request(
 
 
 class ModbusSession:
-    """A link to one device, with one request at a time; every error is a ``DeviceError``.
-
-    ``framing`` is that of the link, if it differs from the profile's, as behind a gateway.
-    """
+    """A link to one device, with one request at a time; every error is a ``DeviceError``."""
 
     def __init__(
         self,
@@ -241,11 +240,11 @@ class ModbusSession:
         unit: int,
         sleep: Callable[[float], None] = time.sleep,
         *,
-        framing: Literal["tcp", "rtu"] | None = None,
+        framing: Literal["tcp", "rtu"],
     ) -> None:
         self.profile = profile
         self.link = link
-        self._framing = framing or ("tcp" if profile.link.kind == "tcp" else "rtu")
+        self._framing = framing
         self.unit = unit
         self._sleep = sleep
 
@@ -480,3 +479,18 @@ def _steps_time(profile: ModbusProfile, steps: Sequence[ModbusStep]) -> WireTime
     requests = [pdu for step in steps for pdu in _step_requests(profile, step)]
     waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
     return _requests_time(profile, requests).waiting(waits_s)
+
+
+def session_at(endpoint: Endpoint, link: Link) -> ModbusSession:
+    """Return a session with a device, on a link that it may share with others."""
+    assert endpoint.unit is not None, "Modbus devices have an address"
+    framing: Literal["tcp", "rtu"] = "tcp" if endpoint.framing == "tcp" else "rtu"
+    profile = cast(ModbusProfile, endpoint.profile)
+    return ModbusSession(profile, link, endpoint.unit, framing=framing)
+
+
+class ModbusReader(SessionReader):
+    """A :class:`~hilctl_drivers.dac_setup.SensorReader` for Modbus."""
+
+    session_on = staticmethod(session_at)
+    time = staticmethod(read_time)

@@ -2,10 +2,11 @@
 
 from collections.abc import Callable
 from contextlib import suppress
+from typing import cast
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.modbus.config import ModbusSetup
-from hilctl_drivers.modbus.modbus_profile import ModbusWatchdog
+from hilctl_drivers.dac_setup import DacSetup
+from hilctl_drivers.modbus.modbus_profile import ModbusOutput, ModbusProfile, ModbusWatchdog
 from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.register_map import ModbusStep, RegisterStep
 from hilctl_drivers.transport.links import RefusedError
@@ -15,10 +16,11 @@ from hilctl_drivers.transport.wire_time import check_feeds
 class ModbusWatchdogDriver:
     """The watchdog, as the experiment wants it."""
 
-    def __init__(self, setup: ModbusSetup) -> None:
+    def __init__(self, setup: DacSetup) -> None:
         self._setup = setup
+        self._target = cast(ModbusOutput, setup.output)
         self._wanted = setup.options.watchdog
-        self._has = setup.profile.watchdog
+        self._has = cast(ModbusProfile, setup.writer.profile).watchdog
         self._ticks = 0
         self.feed_every = 0
         """Ticks from one feeding to the next; 0 if exchanges feed it."""
@@ -53,11 +55,11 @@ class ModbusWatchdogDriver:
                 "its watchdog has tripped, and where that has put the output is not known: "
                 "'hilctl safe' puts it at the safe value and clears the trip"
             )
-        output, data = self._setup.output, self._setup.output.format.encode(value)
+        output, data = self._target, self._target.format.encode(value)
         self.write_through(session, lambda: session.write_bytes(output, data))
 
     def _tripped(self, session: ModbusSession) -> bool:
-        has, output = self._has, self._setup.output
+        has, output = self._has, self._target
         assert has != "none"
         if has.tripped != "none":
             return session.is_set(has.tripped)
@@ -71,7 +73,7 @@ class ModbusWatchdogDriver:
 
     def _trip_value(self, session: ModbusSession, has: ModbusWatchdog) -> float | None:
         """Return what a tripped device outputs, in the output's unit; None if not known."""
-        output = self._setup.output
+        output = self._target
         for step in has.safe.get(self._setup.options.output, ()):
             if isinstance(step, RegisterStep) and step.value == "safe":
                 scaled = step.model_copy(update={"scale": output.scale, "offset": output.offset})
@@ -122,4 +124,4 @@ class ModbusWatchdogDriver:
         if self._wanted == "none":
             return ()
         safe = self._setup.chain.output(self._wanted.safe_command)
-        return has.bound(steps, self._setup.output, self._wanted.timeout_s, safe)
+        return has.bound(steps, self._target, self._wanted.timeout_s, safe)

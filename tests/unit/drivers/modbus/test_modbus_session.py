@@ -6,8 +6,7 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import parse_fault
-from hilctl_drivers.modbus.config import ModbusOptions
-from hilctl_drivers.modbus.modbus_dac import ModbusDac
+from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 from hilctl_drivers.modbus.modbus_session import (
     ModbusSession,
     RtuTransaction,

@@ -6,8 +6,7 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.modbus.config import ModbusOptions
-from hilctl_drivers.modbus.modbus_dac import ModbusDac
+from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 from tests.fakes import emulated, made_safe
 from tests.unit.drivers.modbus.conftest import MESSAGE_S, RATE_HZ, exchange
 from tests.unit.drivers.modbus.conftest import TIMEOUT_S as ANSWER_S
