@@ -80,12 +80,13 @@ class Endpoint:
 
     def stream(self, extra_s: float = 0.0) -> StreamLink:
         """Return a new link without framing; ``extra_s`` is added to the timeout of each answer."""
-        assert isinstance(self.profile.link, StreamSettings), "Modbus TCP has framing"
-        settings, timeout_s = self.profile.link.settings, self.timeout_s + extra_s
-        if not self.host:
-            return SerialLink(str(self.port), settings, timeout_s)
-        gap_s, echo = settings.gap_s, settings.echo
-        return TcpStream(self.host, int(self.port), timeout_s, gap_s, echo=echo)
+        line, timeout_s = self.profile.link, self.timeout_s + extra_s
+        assert isinstance(line, StreamSettings), "Modbus TCP has framing"
+        if self.host:
+            port, gap_s = int(self.port), line.silence_s
+            return TcpStream(self.host, port, timeout_s, gap_s, echo=line.removes_echo)
+        assert isinstance(line, SerialLineSettings)
+        return SerialLink(str(self.port), line, timeout_s)
 
 
 def _check_keys(options: AddressOptions, above: str) -> None:

@@ -2,7 +2,6 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from dataclasses import replace
 from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
 from pydantic import Field, StringConstraints, model_validator
@@ -10,7 +9,6 @@ from pydantic import Field, StringConstraints, model_validator
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
 from hilctl.base.table import known_unit
-from hilctl_drivers.transport.serial_port import SerialSettings
 from hilctl_drivers.transport.wire_time import WireTime
 
 
@@ -50,9 +48,9 @@ class StreamSettings(LinkSettings):
         return self.gap_s or 0.0
 
     @property
-    def settings(self) -> SerialSettings:
-        """Settings of the link."""
-        return SerialSettings(gap_s=self.silence_s, echo=self.echo)
+    def removes_echo(self) -> bool:
+        """Whether the link removes the echo of a request, not the session."""
+        return self.echo
 
 
 class SerialLineSettings(StreamSettings):
@@ -102,13 +100,6 @@ class SerialLineSettings(StreamSettings):
     def medium(self) -> str:
         """Baud and character format."""
         return f"at {self.baud} {self.bytesize}{self.parity}{self.stopbits}"
-
-    @property
-    def settings(self) -> SerialSettings:
-        """Settings of the port."""
-        same = {"baud", "bytesize", "parity", "stopbits", "flow", "dtr", "rts", "rs485"}
-        values = self.model_dump(include=same)
-        return replace(super().settings, boot_s=self.boot_wait_s, **values)
 
 
 class BinaryLineSettings(SerialLineSettings):

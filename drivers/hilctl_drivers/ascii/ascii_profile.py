@@ -16,7 +16,7 @@ order are those of :mod:`hilctl_drivers.modbus.register_map`. The example shows 
 import math
 import re
 from collections.abc import Iterator
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cache
 from string import Formatter
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias, cast, get_args
@@ -37,7 +37,6 @@ from hilctl_drivers.profile_base import (
 )
 from hilctl_drivers.transport.crc import CrcName
 from hilctl_drivers.transport.links import BadRequestError
-from hilctl_drivers.transport.serial_port import SerialSettings
 
 SAMPLES = {"value": 0.0, "safe": 0.0, "address": 1, "timeout": 1}
 """The fields of templates, with a value for each."""
@@ -148,9 +147,9 @@ class TextLines(StreamSettings):
         return self.min_gap_s if self.gap_s is None else self.gap_s
 
     @property
-    def settings(self) -> SerialSettings:
-        """Settings of the link; the session takes the lines that come back, for its terminators."""
-        return replace(super().settings, echo=False)
+    def removes_echo(self) -> bool:
+        """No: the session takes the lines that come back, for its terminators."""
+        return False
 
 
 class AsciiLink(TextLines, SerialLineSettings):

@@ -238,7 +238,7 @@ class AsciiSession:
         self.profile = profile
         self._requests, self._replies = formats(profile.link)
         # An echo of frames is removed by the link.
-        self._echoes = profile.link.echo and not profile.link.settings.echo
+        self._echoes = profile.link.echo and not profile.link.removes_echo
         self.address = profile.unit if address is None else address
         self._sleep = sleep
         watchdog = profile.watchdog

@@ -6,14 +6,13 @@ import os
 import select
 import time
 from collections.abc import Callable
-from dataclasses import dataclass
-from typing import Literal
 
 import serial
 from serial.rs485 import RS485Settings
 
 from hilctl.base.errors import DeviceError
 from hilctl.base.files import PORT_REMEDIES, reason
+from hilctl_drivers.profile_base import SerialLineSettings
 from hilctl_drivers.transport.links import LostError
 from hilctl_drivers.transport.resource_names import (
     admit_others,
@@ -23,35 +22,7 @@ from hilctl_drivers.transport.resource_names import (
 from hilctl_drivers.transport.stream_link import StreamLink
 
 
-@dataclass(frozen=True, slots=True)
-class SerialSettings:
-    """Settings of a serial line.
-
-    Attributes:
-        gap_s: Silence to keep between a reply and the next request.
-        boot_s: Wait after opening the port, for boards that reset then.
-        flow: Flow control. With xonxoff, bytes 0x11 and 0x13 are signals and never data; with
-            rts_cts, the lines RTS and CTS are.
-        dtr: Level to hold DTR at; None to raise it, as opening a port does.
-        rts: Level to hold RTS at, likewise.
-        rs485: Level of RTS while sending, which the kernel then switches.
-        echo: Whether each request comes back before its reply.
-    """
-
-    baud: int = 9600
-    bytesize: Literal[7, 8] = 8
-    parity: Literal["N", "E", "O"] = "N"
-    stopbits: Literal[1, 2] = 1
-    gap_s: float = 0.0
-    boot_s: float = 0.0
-    flow: Literal["none", "xonxoff", "rts_cts"] = "none"
-    dtr: bool | None = None
-    rts: bool | None = None
-    rs485: Literal["high", "low"] | None = None
-    echo: bool = False
-
-
-def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.Serial:
+def _open_port(path: str, settings: SerialLineSettings, timeout_s: float) -> serial.Serial:
     """Open and lock a port with all settings.
 
     Levels are set before opening. pyserial then applies them first, so a level that the system
@@ -78,7 +49,7 @@ def _open_port(path: str, settings: SerialSettings, timeout_s: float) -> serial.
         port.rs485_mode = RS485Settings(rts_level_for_tx=high, rts_level_for_rx=not high)
     port.port = path
     port.open()
-    if settings.boot_s > 0.0:
+    if settings.boot_wait_s > 0.0:
         try:
             _keep_levels(port.fileno())
         except OSError:
@@ -111,12 +82,12 @@ class SerialLink(StreamLink):
     def __init__(
         self,
         port: str,
-        settings: SerialSettings,
+        settings: SerialLineSettings,
         timeout_s: float,
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        super().__init__(settings.gap_s, timeout_s, clock, sleep, echo=settings.echo)
+        super().__init__(settings.silence_s, timeout_s, clock, sleep, echo=settings.removes_echo)
         self._path = port
         self._settings = settings
         self._port: serial.Serial | None = None
@@ -149,7 +120,7 @@ class SerialLink(StreamLink):
         if boot:
             self._exclusive = refuse_to_others(self._fd, self._path)
             self._stale = True
-            self._sleep(self._settings.boot_s)
+            self._sleep(self._settings.boot_wait_s)
         self._quiet_at = self._clock()
 
     def _send(self, data: bytes | bytearray) -> None:

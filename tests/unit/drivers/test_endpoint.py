@@ -49,8 +49,8 @@ def test_an_address_leads_to_a_link(keys, place, framing, link):
 def test_settings_beside_the_address_are_those_of_the_link():
     keys = {"baud": 115200, "gap_s": 0.002, "boot_wait_s": 1.0, "dtr": False, "rts": True}
     board = endpoint(profile="cobs_board", serial_port="/dev/x", echo=True, rs485="high", **keys)
-    settings = board.profile.link.settings
-    assert (settings.baud, settings.gap_s, settings.boot_s) == (115200, 0.002, 1.0)
+    settings = board.profile.link
+    assert (settings.baud, settings.gap_s, settings.boot_wait_s) == (115200, 0.002, 1.0)
     assert (settings.dtr, settings.rts, settings.rs485, settings.echo) == (
         False,
         True,
@@ -59,7 +59,7 @@ def test_settings_beside_the_address_are_those_of_the_link():
     )
     text = endpoint(profile="tdk_lambda_gen", serial_port="/dev/x", gap_s=0.01, echo=True)
     assert (text.profile.link.silence_s, text.profile.link.echo) == (0.01, True)
-    assert not text.profile.link.settings.echo  # the session takes the lines that come back
+    assert not text.profile.link.removes_echo  # the session takes the lines that come back
 
 
 @pytest.mark.parametrize(

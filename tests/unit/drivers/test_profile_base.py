@@ -37,7 +37,7 @@ def test_provenance_goes_with_a_recording():
 
 
 def test_lines_are_set_as_their_profiles_say():
-    settings = load_profile("tdk_lambda_gen").link.settings
-    assert (settings.baud, settings.parity, settings.gap_s) == (9600, "N", 0.005)
-    assert load_profile("adam_4024").link.settings.gap_s == pytest.approx(35 / 9600)
-    assert load_profile("cobs_board").link.settings.dtr is True
+    settings = load_profile("tdk_lambda_gen").link
+    assert (settings.baud, settings.parity, settings.silence_s) == (9600, "N", 0.005)
+    assert load_profile("adam_4024").link.silence_s == pytest.approx(35 / 9600)
+    assert load_profile("cobs_board").link.dtr is True

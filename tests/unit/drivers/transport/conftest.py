@@ -9,7 +9,8 @@ from contextlib import contextmanager
 
 import pytest
 
-from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
+from hilctl_drivers.profile_base import SerialLineSettings
+from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.tcp import TcpLink
 
 REPLY = b"0123456789"
@@ -58,6 +59,10 @@ def serve():
         peer.stop()
 
 
+def line_settings(**changes):
+    return SerialLineSettings(kind="serial", baud=9600, **changes)
+
+
 def tcp(port, timeout_s=PATIENT_S):
     link = TcpLink("127.0.0.1", port, timeout_s)
     link.open()
@@ -66,7 +71,7 @@ def tcp(port, timeout_s=PATIENT_S):
 
 def serial(path, timeout_s=PATIENT_S, **settings):
     """Return an open link to a line that is silent."""
-    link = SerialLink(path, SerialSettings(**settings), timeout_s)
+    link = SerialLink(path, line_settings(**settings), timeout_s)
     link.open()
     link.drain()
     return link

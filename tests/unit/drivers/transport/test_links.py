@@ -10,13 +10,14 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.transport.links import LostError, NoAnswerError
-from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
+from hilctl_drivers.transport.serial_port import SerialLink
 from tests.fakes import received
 from tests.unit.drivers.transport.conftest import (
     PATIENT_S,
     QUICK_S,
     REPLY,
     answering,
+    line_settings,
     missing,
     serial,
     tcp,
@@ -84,7 +85,7 @@ def test_serial_exchanges(line):
 
 
 def test_serial_port_is_ours_alone(line):
-    first, second = serial(line[1]), SerialLink(line[1], SerialSettings(), QUICK_S)
+    first, second = serial(line[1]), SerialLink(line[1], line_settings(), QUICK_S)
     with pytest.raises(LostError, match=r"can't be opened: .*lock"):
         second.open()
     first.close()
@@ -122,7 +123,7 @@ def test_serial_gap_is_kept(line):
         slept.append(seconds)
         now[0] += seconds
 
-    settings = SerialSettings(9600, gap_s=0.004, boot_s=2.0)
+    settings = line_settings(gap_s=0.004, boot_wait_s=2.0)
     link = SerialLink(name, settings, 1.0, clock=lambda: now[0], sleep=sleep)
     link.open()
     assert slept == [2.0]
@@ -149,7 +150,7 @@ def test_serial_unplugged_is_one_line():
 
 
 def test_serial_missing_port_is_one_line():
-    link = SerialLink("/dev/no_such_port", SerialSettings(), QUICK_S)
+    link = SerialLink("/dev/no_such_port", line_settings(), QUICK_S)
     with pytest.raises(LostError, match="No such file"):
         link.open()
 
@@ -157,7 +158,7 @@ def test_serial_missing_port_is_one_line():
 def test_serial_chatter_does_not_hang(line):
     _, name = line
     times = iter(range(1000))
-    link = SerialLink(name, SerialSettings(), 1.0, clock=lambda: float(next(times)))
+    link = SerialLink(name, line_settings(), 1.0, clock=lambda: float(next(times)))
     link.open()
     link._read = lambda: b"x"
     link._poll = type("Always", (), {"poll": lambda self, ms: [1]})()

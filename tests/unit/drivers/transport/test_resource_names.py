@@ -14,8 +14,8 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.transport import resource_names, serial_port, stream_link
 from hilctl_drivers.transport.links import LostError
 from hilctl_drivers.transport.resource_names import held_address, held_port
-from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
-from tests.unit.drivers.transport.conftest import QUICK_S, serial
+from hilctl_drivers.transport.serial_port import SerialLink
+from tests.unit.drivers.transport.conftest import QUICK_S, line_settings, serial
 
 TIOCGEXCL = 0x80045440
 
@@ -73,7 +73,7 @@ def test_a_link_is_exclusive_while_it_is_open(port, monkeypatch):
     """Not one that is opened for the safe value: nothing may outlive a process that is killed."""
     slave, path = port
     monkeypatch.setattr(resource_names, "_can_open", lambda path: True)
-    link = SerialLink(path, SerialSettings(), QUICK_S)
+    link = SerialLink(path, line_settings(), QUICK_S)
     for boot in (True, False):
         link.open(boot=boot)
         assert is_refused(slave) is boot
@@ -179,7 +179,7 @@ def test_a_port_is_known_by_its_number_too(line):
 def test_a_port_whose_path_leads_to_another_device_is_not_opened(line, monkeypatch):
     """A guardian that retries would send its value to whatever was plugged in since."""
     _, path = line
-    link = SerialLink(path, SerialSettings(), QUICK_S)
+    link = SerialLink(path, line_settings(), QUICK_S)
     link.open()
     link.open()
     link.close()

@@ -11,8 +11,15 @@ from hilctl.base.errors import InputError
 from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.transport import stream_link
 from hilctl_drivers.transport.links import NoAnswerError
-from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
-from tests.unit.drivers.transport.conftest import QUICK_S, REPLY, answering, missing, serial
+from hilctl_drivers.transport.serial_port import SerialLink
+from tests.unit.drivers.transport.conftest import (
+    QUICK_S,
+    REPLY,
+    answering,
+    line_settings,
+    missing,
+    serial,
+)
 
 XOFF, XON = b"\x13", b"\x11"
 
@@ -45,7 +52,7 @@ def test_modem_lines_get_their_levels_once(line, levels, dtr, rts):
 def test_modem_lines_are_set_before_the_board_starts(line, levels):
     """What resets a board must not come after the wait for it."""
     seen = []
-    settings = SerialSettings(dtr=False, boot_s=2.0)
+    settings = line_settings(dtr=False, boot_wait_s=2.0)
     link = SerialLink(line[1], settings, QUICK_S, sleep=lambda s: seen.append((s, list(levels))))
     link.open()
     link.close()
@@ -86,7 +93,7 @@ def test_a_device_that_holds_the_line_is_an_error_in_time(line):
 
 def test_time_spent_on_sending_is_not_there_for_the_answer(line, monkeypatch):
     now = [0.0]
-    link = SerialLink(line[1], SerialSettings(), 1.0, clock=lambda: now[0])
+    link = SerialLink(line[1], line_settings(), 1.0, clock=lambda: now[0])
     link.open()
     link.drain()
 
@@ -107,7 +114,7 @@ def test_time_spent_on_sending_is_not_there_for_the_answer(line, monkeypatch):
 def test_a_reply_that_came_while_the_host_stalled_is_read(line, came):
     master, name = line
     now, stalled = [0.0], []
-    link = SerialLink(name, SerialSettings(), QUICK_S, clock=lambda: now[0])
+    link = SerialLink(name, line_settings(), QUICK_S, clock=lambda: now[0])
     link.open()
     link.drain()
 
@@ -144,14 +151,6 @@ def test_long_replies_are_put_together(line):
     link.close()
 
 
-def test_profiles_say_how_their_line_is_set():
-    profile = with_link(load_profile("kepco_bop"), flow="xonxoff", dtr=True, rts=False)
-    settings = profile.link.settings
-    assert (settings.flow, settings.dtr, settings.rts) == ("xonxoff", True, False)
-    settings = load_profile("icp_m7024").link.settings
-    assert (settings.flow, settings.dtr, settings.rts) == ("none", None, None)
-
-
 @pytest.mark.parametrize("name", ["icp_m7024", "cobs_board"])
 def test_binary_lines_refuse_flow_control(name):
     with pytest.raises(InputError, match="flow must not be xonxoff"):
@@ -161,7 +160,7 @@ def test_binary_lines_refuse_flow_control(name):
 @pytest.mark.parametrize("change", [{"rts": True}, {"rs485": "high"}])
 def test_rts_is_either_flow_control_or_a_level(change):
     profile = load_profile("npoint_lc400")
-    assert with_link(profile, flow="rts_cts").link.settings.flow == "rts_cts"
+    assert with_link(profile, flow="rts_cts").link.flow == "rts_cts"
     with pytest.raises(InputError, match="rs485 must be omitted"):
         with_link(profile, flow="rts_cts", **change)
 
@@ -178,7 +177,7 @@ def test_levels_stay_when_the_port_of_a_board_that_boots_is_closed(line):
     termios.tcsetattr(plain._fd, termios.TCSANOW, attributes)
     assert falls(plain)
     plain.close()
-    link = SerialLink(line[1], SerialSettings(boot_s=2.0), QUICK_S, sleep=lambda seconds: None)
+    link = SerialLink(line[1], line_settings(boot_wait_s=2.0), QUICK_S, sleep=lambda seconds: None)
     link.open()
     assert not falls(link)
     link.close()
@@ -197,7 +196,7 @@ def test_a_value_is_sent_past_a_line_that_never_falls_silent(line):
 
 def test_opening_waits_for_a_boot_unless_it_must_not(line):
     slept = []
-    link = SerialLink(line[1], SerialSettings(boot_s=2.0), QUICK_S, sleep=slept.append)
+    link = SerialLink(line[1], line_settings(boot_wait_s=2.0), QUICK_S, sleep=slept.append)
     link.open(boot=False)
     assert slept == []
     link.open()

@@ -10,9 +10,9 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.transport.links import CorruptError, LostError, NoAnswerError
-from hilctl_drivers.transport.serial_port import SerialLink, SerialSettings
+from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.tcp import TcpStream
-from tests.unit.drivers.transport.conftest import PATIENT_S, QUICK_S, REPLY, missing
+from tests.unit.drivers.transport.conftest import PATIENT_S, QUICK_S, REPLY, line_settings, missing
 
 
 @contextmanager
@@ -166,7 +166,7 @@ def test_a_peer_that_reads_nothing_is_an_error_in_time():
 
 def test_an_echo_on_a_line_is_taken_off(line):
     master, name = line
-    link = SerialLink(name, SerialSettings(echo=True), PATIENT_S)
+    link = SerialLink(name, line_settings(echo=True), PATIENT_S)
     link.open()
     link.drain()
     thread = threading.Thread(target=lambda: os.write(master, os.read(master, 100) + REPLY))
@@ -177,6 +177,6 @@ def test_an_echo_on_a_line_is_taken_off(line):
 
 
 def test_a_port_without_an_rs485_mode_says_so(line):
-    link = SerialLink(line[1], SerialSettings(rs485="high"), QUICK_S)
+    link = SerialLink(line[1], line_settings(rs485="high"), QUICK_S)
     with pytest.raises(LostError, match="omit rs485"):
         link.open()
