@@ -3,7 +3,7 @@
 ``hilctl`` never imports this package; its registry loads a device by name. Modules here import only
 ``hilctl.base`` and ``hilctl.kernels``.
 
-device.py, serial_dac.py    bases of devices
+device.py, wired_dac.py     bases of devices
 signal_chain.py             options of every DAC: address, amplifier, sensor, reader, watchdog
 endpoint.py, dac_setup.py   addresses and links; output and reader of the sensor as one device
 profile.py, profile_base.py profiles of commercial devices; the files are in profiles/

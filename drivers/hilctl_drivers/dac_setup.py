@@ -1,4 +1,4 @@
-"""A DAC on a link: its options resolved against the profiles, and the session with its sensor.
+"""A DAC's options resolved against the profiles, and the session that reads its sensor.
 
 The sensor is read by the device with the output or by another one, the reader, of any protocol. The
 reader has a link of its own, or shares the line or connection of the output.
@@ -12,7 +12,7 @@ from typing import Any, ClassVar, Self, cast
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import InputError
-from hilctl_drivers.device import DacDevice, details_of
+from hilctl_drivers.device import details_of
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.profile_base import Range
 from hilctl_drivers.signal_chain import (
@@ -23,8 +23,6 @@ from hilctl_drivers.signal_chain import (
     measuring_input,
 )
 from hilctl_drivers.transport.links import Link, naming
-from hilctl_drivers.transport.safe_exchange import SafeExchange
-from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 
@@ -288,120 +286,3 @@ class SessionReader(SensorReader):
 
     def _finish(self) -> None:
         self._session.run(self._session.profile.close)
-
-
-_PROMPT_S = 0.2
-"""A longer delay of the safe value is mentioned in ``safe_note``."""
-
-
-class WiredDac(DacDevice):
-    """A DAC with a profile, on a link, and the session that reads its sensor.
-
-    Attributes:
-        KIND: Its kind in experiments.
-        ACTION: An exchange in messages.
-    """
-
-    KIND: ClassVar[str]
-    ACTION: ClassVar[str] = "write {output}, read {input}"
-    block_max = 1  # samples of one exchange
-    fifo_depth = 0  # samples; 0 without a FIFO
-    measures = False  # whether exchanges fill ``measured``
-    longest_message_s = 0.0  # longest delay of the safe value by a running exchange
-    arm_s = 0.0  # longest time to arm the watchdog
-    unconfirmed = ""  # why a written value cannot be confirmed; empty if it can
-
-    def __init__(self, options: Any, link: Link | None = None) -> None:
-        """Describe the device, on a new link or the given one; nothing is sent before :meth:`open`.
-
-        Raises:
-            InputError: The profile cannot be used, or the options do not fit it.
-        """
-        self._options = options
-        self._setup = setup = DacSetup.of(options)
-        self._chain = setup.chain
-        self._link = link or setup.writer.link()
-        self._safe_exchange = SafeExchange()
-        self._prepare()
-        title = f"{self.KIND} {setup.writer.name} at {setup.writer.place}"
-        action = self.ACTION.format(output=options.output, input=options.input)
-        super().__init__(self._describe(), title, action, options.output)
-
-    @abstractmethod
-    def _prepare(self) -> None:
-        """Set the attributes of the class; raise InputError if an option is not supported."""
-
-    def _describe(self) -> DeviceInfo:
-        options, streams = self._options, self.fifo_depth > 0
-        details = {}
-        if streams:
-            details["fifo_depth"] = f"{self.fifo_depth} samples"
-            details["fifo_level"] = f"{options.fifo_blocks} blocks"
-        return self._setup.info(
-            self.KIND,
-            self._rates(self.block_max),
-            buffered=streams,
-            fifo_depth=self.fifo_depth,
-            latency_blocks=options.fifo_blocks if streams else 0,
-            measures_command=self.measures,
-            arm_s=0.0 if options.watchdog == "none" else self.arm_s,
-            safe_note="; ".join(filter(None, (self._late_note(), self.unconfirmed))),
-            confirms=not self.unconfirmed,
-            details=details,
-        )
-
-    def _late_note(self) -> str:
-        if self.longest_message_s <= _PROMPT_S:
-            return ""
-        timeout_s = self._options.watchdog_timeout_s
-        behind = "no watchdog of the device stands behind it"
-        if timeout_s is not None:
-            behind = f"the device's watchdog acts after {timeout_s:g} s"
-        return f"a message takes up to {self.longest_message_s:.2g} s on this line; {behind}"
-
-    def _longest_block(self) -> tuple[int, str]:
-        return self.block_max, ""
-
-    def _output(self) -> float | None:
-        held = self._held()
-        return None if held is None else self._chain.command(held)
-
-    def _abandon(self) -> None:
-        """Keep a serial port: opening it again could reset a board before its output is safe.
-
-        The reader is kept too: the safe value must not wait until its port is closed.
-        """
-        self._link.doubt()
-
-    def _put_out(self, command: float) -> None:
-        # No self-test, no init steps, no reader: none of them may cost the safe value.
-        value, link = self._chain.output(command), self._link
-        if isinstance(link, StreamLink):
-            self._safe_exchange.attempt(
-                link, lambda: self._send(value), lambda: self._confirm(value)
-            )
-        else:
-            link.open()  # a new connection: no answer to an older command can come on it
-            self._confirm(value)
-
-    @abstractmethod
-    def _held(self) -> float | None:
-        """Return the output's value in its unit; None if it cannot be known."""
-
-    @abstractmethod
-    def _send(self, value: float) -> None:
-        """Send ``value``, in the output's unit, without waiting for an answer."""
-
-    @abstractmethod
-    def _confirm(self, value: float) -> None:
-        """Write ``value``, in the output's unit.
-
-        Raises:
-            UnconfirmedError: It was sent, and no answer of the device would confirm it.
-            DeviceError: The device did not confirm it.
-        """
-
-    def _release(self) -> None:
-        self._link.close()
-        if self._reader is not None:
-            self._reader.release()

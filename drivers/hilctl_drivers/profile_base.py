@@ -267,7 +267,7 @@ class BaseProfile(StrictModel):
 
     @property
     def driver(self) -> str:
-        """The :class:`~hilctl_drivers.serial_dac.SerialDac` for it; empty for other devices."""
+        """The :class:`~hilctl_drivers.wired_dac.SerialDac` for it; empty for other devices."""
         return ""
 
     @property

@@ -28,7 +28,7 @@ BUILTIN: dict[str, str] = {
     "simulated_piezo": "hilctl_drivers.simulated.devices:SimulatedPiezo",
     "modbus_dac": "hilctl_drivers.modbus.modbus_dac:ModbusDac",
     "modbus_stream": "hilctl_drivers.labjack.modbus_stream:ModbusStream",
-    "serial_dac": "hilctl_drivers.serial_dac:SerialDac",
+    "serial_dac": "hilctl_drivers.wired_dac:SerialDac",
 }
 GROUP = "hilctl.devices"
 SHIPPED_PROFILES = "hilctl_drivers.profile:shipped_profiles"

@@ -20,8 +20,8 @@ from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl_drivers.modbus.modbus_dac import ModbusDac
 from hilctl_drivers.modbus.pdu import rtu_adu
 from hilctl_drivers.profile import shipped_profiles
-from hilctl_drivers.serial_dac import SerialDac
 from hilctl_drivers.transport.framing import binary_framing
+from hilctl_drivers.wired_dac import SerialDac
 
 TIMEOUT_S = 0.15
 RATE_HZ = 10.0

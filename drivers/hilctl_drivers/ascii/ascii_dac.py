@@ -22,10 +22,10 @@ from hilctl_drivers.ascii.ascii_session import (
     query_time,
     reading,
 )
-from hilctl_drivers.serial_dac import SerialDac
 from hilctl_drivers.transport.links import WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
+from hilctl_drivers.wired_dac import SerialDac
 
 _NO_EVIDENCE = (
     "the device cannot confirm it: it does not answer, or repeats what it is sent, and its profile "
@@ -34,7 +34,7 @@ _NO_EVIDENCE = (
 
 
 class AsciiDac(SerialDac):
-    """A :class:`~hilctl_drivers.serial_dac.SerialDac` with lines of text or fixed frames."""
+    """A :class:`~hilctl_drivers.wired_dac.SerialDac` with lines of text or fixed frames."""
 
     def _prepare(self) -> None:
         setup, options = self._setup, self._options

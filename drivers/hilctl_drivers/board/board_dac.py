@@ -18,11 +18,11 @@ from hilctl_drivers.board.frames import exchange_sizes, state_sizes, watchdog_si
 from hilctl_drivers.dac_setup import DacSetup, SensorReader
 from hilctl_drivers.device import check_fifo, check_next
 from hilctl_drivers.profile_base import Range
-from hilctl_drivers.serial_dac import SerialDac
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import Link, WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
+from hilctl_drivers.wired_dac import SerialDac
 
 _USB_BITS_PER_S = {True: 19 * 64 * 8e3, False: 13 * 512 * 8 * 8e3}
 """Bulk payload of full-speed (1 ms) and high-speed (125 us) frames (USB 2.0, tables 5-9, 5-10)."""
@@ -89,7 +89,7 @@ class BoardReader(SensorReader):
 
 
 class BoardDac(SerialDac):
-    """A :class:`~hilctl_drivers.serial_dac.SerialDac` with binary frames."""
+    """A :class:`~hilctl_drivers.wired_dac.SerialDac` with binary frames."""
 
     def _prepare(self) -> None:
         setup, profile = self._setup, self._setup.writer.profile

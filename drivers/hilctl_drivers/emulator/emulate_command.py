@@ -8,7 +8,7 @@ from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
 from types import FrameType
-from typing import Annotated, Any
+from typing import Annotated, Any, cast
 
 import typer
 
@@ -22,9 +22,9 @@ from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLin
 from hilctl_drivers.emulator.rig import ACTUATORS
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import NamedProfile, shipped_profiles
-from hilctl_drivers.serial_dac import SerialOptions
 from hilctl_drivers.signal_chain import AddressOptions, DacOptions
 from hilctl_drivers.simulated.devices import SimulatedOptions
+from hilctl_drivers.wired_dac import SerialOptions
 
 _UNPRIVILEGED = 1024
 _HERE = ("127.0.0.1", "::1", "localhost")
@@ -131,7 +131,8 @@ def _actuator(
     ]
     if of_device:
         raise ConfigError(of_device)
-    return document.validate(ACTUATORS[unit][0], context={"amplifier": amplifier})
+    made = document.validate(ACTUATORS[unit].Options, context={"amplifier": amplifier})
+    return cast(SimulatedOptions, made)
 
 
 def _link(options: AddressOptions) -> LinkKind | None:

@@ -7,7 +7,7 @@ or each has a port of its own, with any protocol.
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Any, Literal, NamedTuple, TypeAlias
+from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_profile import AsciiProfile
@@ -29,14 +29,6 @@ from hilctl_drivers.simulated.devices import PiezoOptions, PiezoStage, Simulated
 
 AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard | EmulatedStream
 _DRIVE_V, _RANGE_UM = 100.0, 50.0  # of a piezo stage if no wiring is given
-
-
-class _Port(NamedTuple):
-    """A wire and its TCP port, 0 for a free one; None for a pty."""
-
-    wire: EmulatedWire
-    tcp_port: int | None = None
-    faulty: bool = True
 
 
 class ListenAddress(NamedTuple):
@@ -73,9 +65,9 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
     log = WriteLog(options.log, time.time_ns() - now_ns)
     server = EmulatorServer(options.faults, clock_ns)
     bench = Bench(Rig(now_ns, plan.actuator), plan.wiring, log)
-    device, reader, ports = plan.devices(bench)
+    device, reader, wires = plan.devices(bench)
     try:
-        addresses = [_opened(server, port, options.host) for port in ports]
+        addresses = [each.open(server, wire, options.host) for each, wire in wires]
     except InputError:
         server.close()
         log.close()
@@ -86,16 +78,10 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
         device=device,
         reader=reader,
         actuator=plan.actuator,
-        wires=tuple(port.wire for port in ports),
+        wires=tuple(wire for _, wire in wires),
         places=plan.listen_addresses(addresses),
         options={**plan.channels(), **plan.places(addresses)},
     )
-
-
-def _opened(server: EmulatorServer, port: _Port, host: str) -> str:
-    if port.tcp_port is None:
-        return server.open_pty(port.wire, faulty=port.faulty)
-    return server.listen_tcp(port.wire, host, port.tcp_port)
 
 
 class _Plan:
@@ -103,8 +89,11 @@ class _Plan:
 
     def __init__(self, options: EmulatorOptions) -> None:
         self._options = options
-        self._profile = profile = load_profile(options.profile)
-        self._reader = reader = profile if options.reader is None else load_profile(options.reader)
+        self._served = self._shown = _Served.of(options.profile, options.link, options.port)
+        if options.reader is not None:
+            link = options.reader_link or options.link
+            self._shown = _Served.of(options.reader, link, options.reader_port, faulty=False)
+        self._profile, self._reader = profile, reader = self._served.profile, self._shown.profile
         outputs, sensors = list(profile.outputs), list(reader.sensor_inputs)
         self._output = _chosen("output to drive the rig with", options.output, outputs, profile)
         self._sensor = _chosen("input to show a displacement at", options.sensor, sensors, reader)
@@ -120,16 +109,11 @@ class _Plan:
         stalls = any(each.kind == "stall" for each in options.faults)
         if stalls and not isinstance(reader, StreamProfile):
             raise InputError(f"fault stall: {reader.title} does not send unasked")
-        self._links = (
-            _Served.of(profile, options.link),
-            _Served.of(reader, options.reader_link or options.link),
-        )
         self._apart = reader is not profile and not self._may_share(options.reader_line)
         """Whether the reader is on a wire of its own."""
         self.reader_unit_id = self._unit_of_reader()
-        if any(fault.kind == "reset" for fault in options.faults) and not all(
-            link.tcp for link in self._links
-        ):
+        resets = any(fault.kind == "reset" for fault in options.faults)
+        if resets and not (self._served.tcp and self._shown.tcp):
             raise InputError("fault reset is for tcp: a serial line has no connection to break")
 
     def _may_share(self, wanted: ReaderLine | None) -> bool:
@@ -139,7 +123,8 @@ class _Plan:
         if wanted == "same" and not alike:
             raise InputError(f"{reader.title} can't share the line of {profile.title}: use own")
         shares = wanted or ("same" if reader.link.kind == "rtu" else "own")
-        return alike and shares == "same" and self._links[0] == self._links[1]
+        links = {(each.tcp, each.framing) for each in (self._served, self._shown)}
+        return alike and shares == "same" and len(links) == 1
 
     def _unit_of_reader(self) -> int | None:
         """Return the reader's unit id on Modbus; on the same line it must not be the other's."""
@@ -154,21 +139,23 @@ class _Plan:
             raise InputError(f"reader_unit_id must not be {wanted}, that of {profile.title}")
         return reader.unit_id + (reader.unit_id == profile.unit_id) if wanted is None else wanted
 
-    def devices(self, bench: Bench) -> tuple[AnyDevice, AnyDevice, list[_Port]]:
-        """Return the devices that drive and show the rig, and where they are served."""
-        reads_itself = self._reader is self._profile
-        device = reader = self._device(
-            self._profile, bench, self._output, self._sensor if reads_itself else None
-        )
-        if not reads_itself:
-            reader = self._device(self._reader, bench, None, self._sensor)
-        if reads_itself or self._apart:
-            ports = [self._port(0, {self._profile.usual_unit: device})]
-            if self._apart:
-                ports.append(self._port(1, {self.reader_unit_id: reader}))
-            return device, reader, ports
-        unit = self.reader_unit_id if self.reader_unit_id is not None else self._reader.usual_unit
-        return device, reader, [self._port(0, {unit: reader, self._profile.usual_unit: device})]
+    def devices(
+        self, bench: Bench
+    ) -> tuple[AnyDevice, AnyDevice, list[tuple["_Served", EmulatedWire]]]:
+        """Return the devices that drive and show the rig, and the wires to serve."""
+        options, served, shown = self._options, self._served, self._shown
+        here, unit = self._profile.usual_unit, self.reader_unit_id
+        if served is shown:
+            device = self._device(self._profile, bench, self._output, self._sensor)
+            return device, device, [(served, served.wire({here: device}, options))]
+        device = self._device(self._profile, bench, self._output, None)
+        reader = self._device(self._reader, bench, None, self._sensor)
+        if self._apart:
+            wires = served.wire({here: device}, options), shown.wire({unit: reader}, options)
+            return device, reader, [(served, wires[0]), (shown, wires[1])]
+        unit = self._reader.usual_unit if unit is None else unit
+        both = served.wire({unit: reader, here: device}, options)
+        return device, reader, [(served, both)]
 
     def _device(
         self, profile: BaseProfile, bench: Bench, output: str | None, sensor: str | None
@@ -186,24 +173,6 @@ class _Plan:
             return EmulatedBoard(profile, bench, output, sensor)
         assert isinstance(profile, AsciiProfile)
         return EmulatedText(profile, bench, output, sensor)
-
-    def _port(self, which: int, devices: dict[int | None, AnyDevice]) -> _Port:
-        options, link = self._options, self._links[which]
-        profile = (self._profile, self._reader)[which]
-        wire: EmulatedWire
-        if isinstance(profile, ModbusProfile):
-            units: Any = devices
-            wire = ModbusWire(link.framing, units, options.lacking, options.mute)
-        elif isinstance(profile, StreamProfile):
-            (only,) = devices.values()
-            assert isinstance(only, EmulatedStream)
-            wire = only
-        else:
-            assert isinstance(profile, SerialProfile)
-            members: Any = list(devices.values())[::-1]
-            wire = EmulatedLine(profile, members)
-        port = (options.port, options.reader_port)[which] if link.tcp else None
-        return _Port(wire, port, faulty=which == 0 or isinstance(profile, ModbusProfile))
 
     def channels(self) -> dict[str, Any]:
         """Return the part of a device section with profile, channels and wiring."""
@@ -234,37 +203,58 @@ class _Plan:
 
     def places(self, addresses: list[str]) -> dict[str, Any]:
         """Return the part of a device section with the addresses of the devices."""
-        made = self._place(0, addresses[0])
+        made = self._served.place(addresses[0])
         if self._reader is not self._profile:
             unit = {} if self.reader_unit_id is None else {"unit_id": self.reader_unit_id}
-            place = self._place(1, addresses[1]) if self._apart else {}
+            place = self._shown.place(addresses[1]) if self._apart else {}
             made["reader"] = {"profile": self._options.reader, **unit, **place}
         return made
 
-    def _place(self, which: int, address: str) -> dict[str, Any]:
-        if not self._links[which].tcp:
-            return {"serial_port": address}
-        host, _, port = address.rpartition(":")
-        usual = next(iter((self._profile, self._reader)[which].framings), "rtu")
-        framing = self._links[which].framing
-        framed = {} if framing == usual else {"framing": framing}
-        return {"host": host, "tcp_port": int(port), **framed}
 
+@dataclass(frozen=True, slots=True)
+class _Served:
+    """A device, and how it is served: on a TCP port or a pty, and the frames of Modbus."""
 
-class _Served(NamedTuple):
-    """How a device is served: on a TCP port or a pty, and the frames of Modbus."""
-
+    profile: BaseProfile
     tcp: bool
     framing: Literal["tcp", "rtu"]
+    port: int  # 0 for a free one
+    faulty: bool  # whether faults happen on its pty
 
     @classmethod
-    def of(cls, profile: BaseProfile, wanted: LinkKind | None) -> "_Served":
+    def of(cls, name: str, wanted: LinkKind | None, port: int, *, faulty: bool = True) -> "_Served":
         """Return what an option wants of a device, or what its profile says."""
+        profile = load_profile(name)
         if isinstance(profile, ModbusProfile):
             kind = wanted or profile.link.kind
-            return cls(kind != "rtu", "tcp" if kind == "tcp" else "rtu")
+            return cls(profile, kind != "rtu", "tcp" if kind == "tcp" else "rtu", port, True)
         on_line = isinstance(profile.link, SerialLineSettings)
-        return cls(wanted == "tcp" or not on_line, "rtu")
+        return cls(profile, wanted == "tcp" or not on_line, "rtu", port, faulty)
+
+    def wire(self, devices: dict[Any, Any], options: EmulatorOptions) -> EmulatedWire:
+        """Return a wire with devices by unit, the last one the first to be asked."""
+        if isinstance(self.profile, ModbusProfile):
+            return ModbusWire(self.framing, devices, options.lacking, options.mute)
+        members = list(devices.values())[::-1]
+        if isinstance(self.profile, StreamProfile):
+            return cast(EmulatedStream, members[0])
+        assert isinstance(self.profile, SerialProfile)
+        return EmulatedLine(self.profile, members)
+
+    def open(self, server: EmulatorServer, wire: EmulatedWire, host: str) -> str:
+        """Serve a wire, and return its address."""
+        if self.tcp:
+            return server.listen_tcp(wire, host, self.port)
+        return server.open_pty(wire, faulty=self.faulty)
+
+    def place(self, address: str) -> dict[str, Any]:
+        """Return an address as in a device section."""
+        if not self.tcp:
+            return {"serial_port": address}
+        host, _, port = address.rpartition(":")
+        usual = next(iter(self.profile.framings), "rtu")
+        framed = {} if self.framing == usual else {"framing": self.framing}
+        return {"host": host, "tcp_port": int(port), **framed}
 
 
 def _rig(
@@ -281,7 +271,8 @@ def _rig(
             (low_v, high_v), reach_um = wiring.command_range, wiring.displacement_range
             stage = PiezoStage.fitted(low_v, high_v, max(map(abs, reach_um)))
         actuator = actuator.model_copy(update={"stage": stage})
-    device = next(make(actuator) for kind, make in ACTUATORS.values() if kind is type(actuator))
+    make: Any = next(each for each in ACTUATORS.values() if each.Options is type(actuator))
+    device: SimulatedDevice = make(actuator)
     wiring = wiring or SimulatedWiring.spread(output, sensor_input, device)
     unit = device.info.command_unit
     if wiring.command_unit != unit:

@@ -16,23 +16,13 @@ from hilctl.base.types import F64, CommandUnit
 from hilctl_drivers.profile_base import BaseProfile, Range
 from hilctl_drivers.signal_chain import Amplifier, Sensor, SignalChain
 from hilctl_drivers.simulated.actuator_base import Plant
-from hilctl_drivers.simulated.devices import (
-    PiezoOptions,
-    SimulatedDevice,
-    SimulatedOptions,
-    SimulatedPiezo,
-    SimulatedTerfenol,
-    TerfenolOptions,
-)
+from hilctl_drivers.simulated.devices import SimulatedDevice, SimulatedPiezo, SimulatedTerfenol
 
 RATE_HZ = 10_000.0
 SETTLED_S = 1.0  # the slowest part of the rig has a time constant of 0.1 ms
 _CHUNK = 1000
-ACTUATORS: dict[CommandUnit, tuple[type[SimulatedOptions], Callable[[Any], SimulatedDevice]]] = {
-    "A": (TerfenolOptions, SimulatedTerfenol),
-    "V": (PiezoOptions, SimulatedPiezo),
-}
-"""Options and class of the actuator behind an emulated device, by the unit of its drive."""
+ACTUATORS: dict[CommandUnit, type[SimulatedDevice]] = {"A": SimulatedTerfenol, "V": SimulatedPiezo}
+"""The actuator behind an emulated device, by the unit of its drive."""
 
 
 class Rig:

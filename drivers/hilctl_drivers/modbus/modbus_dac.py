@@ -15,7 +15,7 @@ import numpy as np
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError, InputError, UnconfirmedError
 from hilctl.base.types import F64
-from hilctl_drivers.dac_setup import SensorReader, WiredDac
+from hilctl_drivers.dac_setup import SensorReader
 from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusOutput, ModbusProfile
 from hilctl_drivers.modbus.modbus_session import (
     arm_s,
@@ -33,6 +33,7 @@ from hilctl_drivers.transport.links import Link, NoAnswerError, RefusedError
 from hilctl_drivers.transport.safe_exchange import check_read_back, try_out
 from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
+from hilctl_drivers.wired_dac import WiredDac
 
 Swap: TypeAlias = Callable[[bytes], float]
 """Write register bytes to the output and return the value of the input in its unit.
@@ -54,7 +55,7 @@ class ModbusDevice(WiredDac):
     _reader: SensorReader
 
     def __init__(self, options: DacOptions, link: Link | None = None) -> None:
-        """See :class:`~hilctl_drivers.dac_setup.WiredDac`."""
+        """See :class:`~hilctl_drivers.wired_dac.WiredDac`."""
         profile = options.profile.profile
         if not isinstance(profile, ModbusProfile):
             name = options.profile.name
@@ -178,7 +179,7 @@ class ModbusDac(ModbusDevice):
         if self._setup.measure is not None:
             self._measured_by = self._chain.measured(self._setup.measure)
         self.one_transaction = self._may_combine
-        """Whether a tick is one transaction; known after opening."""
+        """Whether a tick is one transaction, as far as is known; opening it shows."""
 
     def _rates(self, block: int) -> RateLimit:
         """Return the rates with the present number of transactions."""
@@ -234,7 +235,7 @@ class ModbusDac(ModbusDevice):
             self._guard.feed(self._writer)
 
     def _release(self) -> None:
-        self._swap = _not_open
+        self._swap, self.one_transaction = _not_open, self._may_combine
         super()._release()
 
     def _find_swap(self) -> tuple[Swap, bool]:

@@ -7,8 +7,8 @@ import pytest
 
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.profile import shipped_profiles
-from hilctl_drivers.serial_dac import SerialDac, SerialOptions
 from hilctl_drivers.simulated.devices import TerfenolOptions
+from hilctl_drivers.wired_dac import SerialDac, SerialOptions
 from tests.fakes import ShiftedClock, emulated, logged
 
 TIMEOUT_S = 2.0

@@ -6,10 +6,10 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.endpoint import Endpoint, reader_of
-from hilctl_drivers.serial_dac import SerialOptions
 from hilctl_drivers.signal_chain import AddressOptions
 from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.tcp import TcpLink, TcpStream
+from hilctl_drivers.wired_dac import SerialOptions
 
 DCON = Path(__file__).parents[2] / "data" / "dcon_module.yaml"
 CHANNELS = {

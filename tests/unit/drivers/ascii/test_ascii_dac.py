@@ -1,6 +1,6 @@
 """Text devices behind ``serial_dac``: what measures the output, and what a watchdog costs.
 
-Exchanges over a line are in ``tests/unit/drivers/test_serial_dac.py``.
+Exchanges over a line are in ``tests/unit/drivers/test_wired_dac.py``.
 """
 
 from pathlib import Path
@@ -11,7 +11,7 @@ from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_dac import AsciiDac
 from hilctl_drivers.ascii.ascii_session import feed_time
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.serial_dac import SerialOptions
+from hilctl_drivers.wired_dac import SerialOptions
 
 DCON = str(Path(__file__).parents[3] / "data" / "dcon_module.yaml")
 OPTIONS = {

@@ -8,8 +8,8 @@ import pytest
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.sensor_stream.stream_reader import BlockParser
-from hilctl_drivers.serial_dac import SerialDac, SerialOptions
 from hilctl_drivers.transport.links import CorruptError
+from hilctl_drivers.wired_dac import SerialDac, SerialOptions
 from tests.unit.drivers.conftest import TIMEOUT_S
 
 PROFILE = load_profile("capancdt_6200")

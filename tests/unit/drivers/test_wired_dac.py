@@ -9,8 +9,8 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError
-from hilctl_drivers.serial_dac import SerialDac, SerialOptions
 from hilctl_drivers.transport.resource_names import held_port
+from hilctl_drivers.wired_dac import SerialDac, SerialOptions
 from tests.fakes import made_safe
 from tests.unit.drivers.conftest import TIMEOUT_S
 
