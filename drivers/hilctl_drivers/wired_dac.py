@@ -18,6 +18,7 @@ from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, Measure
 from hilctl_drivers.transport.links import Link
 from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back
 from hilctl_drivers.transport.stream_link import StreamLink
+from hilctl_drivers.transport.wire_time import check_feeds
 
 _PROMPT_S = 0.2
 """A longer delay of the safe value is mentioned in ``safe_note``."""
@@ -51,6 +52,7 @@ class WiredDac(DacDevice):
         self._chain = setup.chain
         self._link = link or setup.writer.link()
         self._safe_exchange = SafeExchange()
+        self._feed_every = self._ticks = 0
         self._prepare()
         title = f"{self.KIND} {setup.writer.name} at {setup.writer.place}"
         action = self.ACTION.format(output=options.output, input=options.input)
@@ -90,6 +92,22 @@ class WiredDac(DacDevice):
 
     def _longest_block(self) -> tuple[int, str]:
         return self.block_max, ""
+
+    def _plan_feeding(self, ticks_per_s: float) -> None:
+        """Take the rate of exchanges, or raise DeviceError if it is too low for the watchdog."""
+        has = self._setup.writer.profile.watchdog
+        ticks = check_feeds(self._options.watchdog_timeout_s, ticks_per_s)
+        self._feed_every = ticks if has != "none" and has.kick == "strict" else 0
+        self._ticks = 0
+
+    def _feed(self) -> None:
+        """Feed a watchdog that exchanges do not feed, three times in its timeout."""
+        self._ticks += 1
+        if self._feed_every and self._ticks % self._feed_every == 0:
+            self._run_feed_steps()
+
+    def _run_feed_steps(self) -> None:
+        """Feed the watchdog."""
 
     def _output(self) -> float | None:
         held = self._held()

@@ -24,7 +24,7 @@ from hilctl_drivers.ascii.ascii_session import (
 )
 from hilctl_drivers.transport.links import WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
-from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
+from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 from hilctl_drivers.wired_dac import SerialDac
 
 _NO_EVIDENCE = (
@@ -46,7 +46,6 @@ class AsciiDac(SerialDac):
         self.measures = self._measure is not None
         self._writer = AsciiSession(profile, self._link, setup.writer.unit)
         self._sensor = self._reader = setup.reader_on(self._link)
-        self._feed_every = self._ticks = 0
         # Half duplex: what was asked last is answered before the safe value can go out.
         write = exchange_time(profile, options.output, None)
         busy = self._own_time()
@@ -72,18 +71,14 @@ class AsciiDac(SerialDac):
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         del block
-        feed_every = check_feeds(self._options.watchdog_timeout_s, sample_rate_hz)
-        watchdog = self._profile.watchdog
+        self._plan_feeding(sample_rate_hz)
         self._connect()
         # A device that has tripped refuses the steps that follow.
         self._clear_trip()
         self._writer.run(self._profile.init)
         self._sensor.begin()
         self._try_out_safe_value()
-        strict = watchdog != "none" and watchdog.kick == "strict"
-        self._feed_every = feed_every if strict else 0
         self._writer.check_errors()  # after all steps: those without a reply leave theirs there
-        self._ticks = 0
         self.transactions = (1 if self._is_combined else 2) + self.measures
 
     def _arm(self) -> None:
@@ -245,11 +240,8 @@ class AsciiDac(SerialDac):
         safe = self._target.number(self._chain.output(options.safe_command))
         self._writer.run(steps, timeout=counts, safe=safe)
 
-    def _feed(self) -> None:
-        """Feed a watchdog that exchanges do not feed, three times in its timeout."""
-        self._ticks += 1
-        if self._feed_every and self._ticks % self._feed_every == 0:
-            self._run("feed")
+    def _run_feed_steps(self) -> None:
+        self._run("feed")
 
 
 def _without_numbers(text: str) -> str:

@@ -21,7 +21,7 @@ from hilctl_drivers.profile_base import Range
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import Link, WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
-from hilctl_drivers.transport.wire_time import RateLimit, WireTime, check_feeds
+from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 from hilctl_drivers.wired_dac import SerialDac
 
 _USB_BITS_PER_S = {True: 19 * 64 * 8e3, False: 13 * 512 * 8 * 8e3}
@@ -174,7 +174,7 @@ class BoardSingle(BoardDac):
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         del block
-        check_feeds(self._options.watchdog_timeout_s, sample_rate_hz)
+        self._plan_feeding(sample_rate_hz)
         self._connect()
         if self._reader is not None:
             self._reader.open()
@@ -217,7 +217,7 @@ class BoardStream(BoardDac):
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         check_fifo(block, self._latency_blocks, self.fifo_depth)
-        check_feeds(self._options.watchdog_timeout_s, sample_rate_hz / block)
+        self._plan_feeding(sample_rate_hz / block)
         facts = self._connect(extra_s=block / sample_rate_hz)
         self._check_board(facts, sample_rate_hz, block)
         self._try_out_safe_value()  # before the clock, which SAFE stops

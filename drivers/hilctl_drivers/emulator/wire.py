@@ -8,13 +8,7 @@ from functools import partial
 from string import Formatter
 from typing import TypeAlias
 
-from hilctl_drivers.ascii.ascii_profile import (
-    SAMPLES,
-    AsciiProfile,
-    as_text,
-    binary_format,
-    fill,
-)
+from hilctl_drivers.ascii.ascii_profile import SAMPLES, AsciiProfile, as_text, binary_format, fill
 from hilctl_drivers.ascii.ascii_session import FrameFormat, formats, parse_number
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
 from hilctl_drivers.emulator.rig import EmulatedDevice

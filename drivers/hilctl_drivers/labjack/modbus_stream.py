@@ -27,7 +27,7 @@ from hilctl_drivers.labjack.stream import (
     f32,
     u32,
 )
-from hilctl_drivers.modbus.modbus_dac import ModbusDevice
+from hilctl_drivers.modbus.modbus_device import ModbusDevice
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusInput, ModbusProfile
 from hilctl_drivers.modbus.pdu import FeedbackFrame, ReadFrame, WriteFrame
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks
@@ -285,10 +285,10 @@ class ModbusStream(ModbusDevice):
         The output does not move before enough blocks have come.
         """
         profile, streaming = self._profile, self._streaming
-        self._guard.plan(sample_rate_hz / block)
+        self._plan_feeding(sample_rate_hz / block)
         self._connect()
         writer = self._writer
-        self._guard.end_trip(writer)  # a device that has tripped refuses the steps that follow
+        self._end_trip()  # a device that has tripped refuses the steps that follow
         stream = StreamSession(
             ModbusFeedback(self._link, writer.unit),
             streaming,
@@ -322,8 +322,8 @@ class ModbusStream(ModbusDevice):
         stream.feed(self._chain.output(command))
         self._next_sample += command.size
         readings = self._readings(stream, command.size)
-        if self._guard.feed_every:
-            self._guard.feed(self._writer)
+        if self._feed_every:
+            self._feed()
         if readings is not None:
             self._chain.fill_um(readings, displacement_um)
 

@@ -10,30 +10,20 @@ from collections.abc import Callable
 from dataclasses import replace
 from typing import ClassVar, TypeAlias, cast
 
-import numpy as np
-
 from hilctl.base.device import DeviceOptions
-from hilctl.base.errors import DeviceError, InputError, UnconfirmedError
+from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
-from hilctl_drivers.dac_setup import SensorReader
-from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusOutput, ModbusProfile
+from hilctl_drivers.modbus.modbus_device import ModbusDevice
+from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusProfile
 from hilctl_drivers.modbus.modbus_session import (
-    arm_s,
     combined_request,
-    exchange_time,
     feed_time,
     read_requests,
-    read_time,
-    session_at,
     write_request,
 )
-from hilctl_drivers.modbus.watchdog import ModbusWatchdogDriver
 from hilctl_drivers.signal_chain import DacOptions, Measure
-from hilctl_drivers.transport.links import Link, NoAnswerError, RefusedError
-from hilctl_drivers.transport.safe_exchange import check_read_back, try_out
-from hilctl_drivers.transport.stream_link import StreamLink
-from hilctl_drivers.transport.wire_time import RateLimit, WireTime
-from hilctl_drivers.wired_dac import WiredDac
+from hilctl_drivers.transport.links import NoAnswerError, RefusedError
+from hilctl_drivers.transport.wire_time import RateLimit
 
 Swap: TypeAlias = Callable[[bytes], float]
 """Write register bytes to the output and return the value of the input in its unit.
@@ -47,120 +37,6 @@ class ModbusOptions(DacOptions):
     """Options of ``modbus_dac``."""
 
     measure: Measure = None
-
-
-class ModbusDevice(WiredDac):
-    """Session, watchdog and safe value of ``modbus_dac`` and ``modbus_stream``."""
-
-    _reader: SensorReader
-
-    def __init__(self, options: DacOptions, link: Link | None = None) -> None:
-        """See :class:`~hilctl_drivers.wired_dac.WiredDac`."""
-        profile = options.profile.profile
-        if not isinstance(profile, ModbusProfile):
-            name = options.profile.name
-            raise InputError(f"profile {name} is one for kind: {profile.DEVICE}, not Modbus")
-        super().__init__(options, link)
-
-    def _prepare(self) -> None:
-        setup, options = self._setup, self._options
-        self._profile = cast(ModbusProfile, setup.writer.profile)
-        self._target = cast(ModbusOutput, setup.output)
-        self._writer = session_at(setup.writer, self._link)
-        self._reader = setup.reader_on(self._link)
-        self._guard = ModbusWatchdogDriver(setup)
-        self.measures = setup.measure is not None
-        self.arm_s = arm_s(self._profile, options.output)
-        readback = self._target.readback_register
-        if readback is None and self._target.function == 6 and setup.writer.framing == "rtu":
-            # The correct reply equals the request, and is what a line that echoes gives.
-            self.unconfirmed = (
-                "the device cannot confirm it: on a serial line the reply to function 6 may be an "
-                "echo, and the output cannot be read back"
-            )
-        # One transaction is tried at open. That moves an output that cannot be read back, so it is
-        # not tried there.
-        self._may_combine = (
-            self._profile.exchange != "none" and readback is not None and not setup.reads_elsewhere
-        )
-        setup.check_timeout(self._wire(self._may_combine))
-
-    def _wire(self, one_transaction: bool) -> WireTime:
-        """Return the time of a sample on the wire."""
-        setup, profile = self._setup, self._profile
-        own = None if setup.reads_elsewhere else setup.options.input
-        wire = exchange_time(profile, setup.options.output, own, one_transaction=one_transaction)
-        if setup.measure is not None:
-            wire = wire.then(read_time(profile, setup.measure).named("to measure the output"))
-        return setup.after_reading(wire)
-
-    def _connect(self) -> None:
-        """Connect and check that the devices are the right ones."""
-        self._link.open()
-        self._writer.check_selftest()
-        self._reader.open()
-
-    def _arm(self) -> None:
-        self._guard.arm(self._writer)
-
-    def _held(self) -> float | None:
-        return self._writer.held(self._target)
-
-    def _look(self) -> tuple[float, float | None]:
-        setup, writer = self._setup, self._writer
-        self._connect()
-        reading, held = self._reader.read(), self._held()
-        for name, value in ((setup.options.input, reading), (setup.options.output, held)):
-            if value and abs(value) < np.finfo(np.float32).tiny:
-                raise DeviceError(
-                    f"{name} must be 0 or a normal number, got {value:.3g}: compare its order "
-                    "(ABCD, CDAB, ...) and type in the profile with the device's manual"
-                )
-        displacement_um = setup.chain.displacement_um(reading)
-        watchdog = writer.profile.watchdog
-        flag = "none" if watchdog == "none" else watchdog.tripped
-        if held is None or (flag != "none" and writer.is_set(flag)):
-            return displacement_um, None  # the register keeps the last command
-        return displacement_um, setup.chain.command(held)
-
-    def _send(self, value: float) -> None:
-        assert isinstance(self._link, StreamLink)
-        output = self._target
-        pdu = write_request(self._writer.profile, output, output.format.encode(value))
-        self._link.send_now(self._writer.prepare(pdu).request())
-
-    def _confirm(self, value: float) -> None:
-        output = self._target
-        data = output.format.encode(value)
-        self._guard.write_through(self._writer, lambda: self._write(data))
-        if self.unconfirmed:
-            raise UnconfirmedError(f"the value was sent, but {self.unconfirmed}")
-        found = self._read_back()
-        if found is not None:
-            tolerance = max(output.step, 1e-6 * (output.max - output.min))
-            check_read_back(output, value, found, tolerance)
-
-    def _try_out_safe_value(self) -> None:
-        """Write the held value with the message of the safe value, see :func:`try_out`."""
-        output = self._target
-        data = self._writer.held_data(output)
-        if data is not None:
-            name = f"{self._setup.options.output}, register {output.address}"
-            try_out(output, output.format.decode(data), lambda: self._write(data), f"to {name}")
-
-    def _write(self, data: bytes) -> None:
-        """Write the output's register bytes once."""
-        self._writer.write_bytes(self._target, data)
-
-    def _read_back(self) -> float | None:
-        """Return the value of the output after a safe value; None if it cannot be known."""
-        return self._held()
-
-    def _close(self) -> None:
-        # First: nothing feeds it any more, and it would trip while the close steps run.
-        self._guard.disarm(self._writer)
-        self._writer.run(self._writer.profile.close)
-        self._reader.end()
 
 
 class ModbusDac(ModbusDevice):
@@ -195,9 +71,9 @@ class ModbusDac(ModbusDevice):
         Only a test shows whether the device exchanges in one transaction, and so its highest rate.
         """
         writer = self._writer
-        self._guard.plan(sample_rate_hz)
+        self._plan_feeding(sample_rate_hz)
         self._connect()
-        self._guard.end_trip(writer)  # a device that has tripped refuses the steps that follow
+        self._end_trip()  # a device that has tripped refuses the steps that follow
         writer.run(writer.profile.init)
         self._reader.begin()
         if not self._setup.reads_elsewhere:
@@ -231,8 +107,8 @@ class ModbusDac(ModbusDevice):
         if self._measure is not None:
             gain, offset = self._measured_by
             measured[0] = self._measure() * gain + offset
-        if self._guard.feed_every:
-            self._guard.feed(self._writer)
+        if self._feed_every:
+            self._feed()
 
     def _release(self) -> None:
         self._swap, self.one_transaction = _not_open, self._may_combine

@@ -15,11 +15,7 @@ from typing import Literal, cast
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.dac_setup import SessionReader
 from hilctl_drivers.endpoint import Endpoint
-from hilctl_drivers.modbus.modbus_profile import (
-    ModbusInput,
-    ModbusOutput,
-    ModbusProfile,
-)
+from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusOutput, ModbusProfile
 from hilctl_drivers.modbus.pdu import (
     FEEDBACK,
     TCP_HEAD,
@@ -54,12 +50,7 @@ from hilctl_drivers.modbus.register_map import (
 )
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
-from hilctl_drivers.transport.links import (
-    CorruptError,
-    IncompleteError,
-    Link,
-    RefusedError,
-)
+from hilctl_drivers.transport.links import CorruptError, IncompleteError, Link, RefusedError
 from hilctl_drivers.transport.wire_time import WireTime
 
 _RTU_SHORTEST = 5

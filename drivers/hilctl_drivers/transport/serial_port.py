@@ -14,11 +14,7 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.files import PORT_REMEDIES, reason
 from hilctl_drivers.profile_base import SerialLineSettings
 from hilctl_drivers.transport.links import LostError
-from hilctl_drivers.transport.resource_names import (
-    admit_others,
-    port_identity,
-    refuse_to_others,
-)
+from hilctl_drivers.transport.resource_names import admit_others, port_identity, refuse_to_others
 from hilctl_drivers.transport.stream_link import StreamLink
 
 
