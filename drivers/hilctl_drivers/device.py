@@ -42,6 +42,7 @@ class DacDevice(ABC):
     """
 
     Options: ClassVar[type[DeviceOptions]]
+    block_max = 1  # samples of one exchange
     _reader: "SensorReader | None" = None
 
     def __init__(self, info: DeviceInfo, title: str, action: str, output: str) -> None:
@@ -207,7 +208,7 @@ class DacDevice(ABC):
 
     def _longest_block(self) -> tuple[int, str]:
         """Return the most samples of an exchange, and the reason as text."""
-        return 1, ""
+        return self.block_max, ""
 
     def _rates(self, block: int) -> RateLimit:
         """Return the sample rates that it can keep with this block."""

@@ -34,7 +34,6 @@ class WiredDac(DacDevice):
 
     KIND: ClassVar[str]
     ACTION: ClassVar[str] = "write {output}, read {input}"
-    block_max = 1  # samples of one exchange
     fifo_depth = 0  # samples; 0 without a FIFO
     measures = False  # whether exchanges fill ``measured``
     longest_message_s = 0.0  # longest delay of the safe value by a running exchange
@@ -89,9 +88,6 @@ class WiredDac(DacDevice):
         if timeout_s is not None:
             behind = f"the device's watchdog acts after {timeout_s:g} s"
         return f"a message takes up to {self.longest_message_s:.2g} s on this line; {behind}"
-
-    def _longest_block(self) -> tuple[int, str]:
-        return self.block_max, ""
 
     def _plan_feeding(self, ticks_per_s: float) -> None:
         """Take the rate of exchanges, or raise DeviceError if it is too low for the watchdog."""

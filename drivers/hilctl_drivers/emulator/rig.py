@@ -20,7 +20,6 @@ from hilctl_drivers.simulated.devices import SimulatedDevice, SimulatedPiezo, Si
 
 RATE_HZ = 10_000.0
 SETTLED_S = 1.0  # the slowest part of the rig has a time constant of 0.1 ms
-_CHUNK = 1000
 ACTUATORS: dict[CommandUnit, type[SimulatedDevice]] = {"A": SimulatedTerfenol, "V": SimulatedPiezo}
 """The actuator behind an emulated device, by the unit of its drive."""
 
@@ -35,10 +34,8 @@ class Rig:
     def __init__(self, now_ns: int, actuator: SimulatedDevice) -> None:
         self.actuator = actuator
         self._plant = actuator.plant(RATE_HZ)
-        self._held = np.zeros(_CHUNK)
-        self._read = np.zeros((2, _CHUNK))
         self._origin_ns = now_ns
-        self._samples = 0
+        self._samples = 1
         self.command = 0.0
         self.displacement_um = 0.0
         self._step(1)
@@ -46,11 +43,10 @@ class Rig:
     def advance(self, now_ns: int) -> None:
         """Advance the time until ``now_ns``, with the output held."""
         due = int((now_ns - self._origin_ns) * RATE_HZ * 1e-9)
-        if due - self._samples > SETTLED_S * RATE_HZ:
+        if due > self._samples:
             # Nothing changes any more on a held output, and catching up with hours takes minutes.
-            self._samples = due - int(SETTLED_S * RATE_HZ)
-        while self._samples < due:
-            self._step(min(_CHUNK, due - self._samples))
+            self._step(min(due - self._samples, int(SETTLED_S * RATE_HZ)))
+            self._samples = due
 
     def put_out(self, command: float, now_ns: int) -> None:
         """Change the output; the amplifier saturates at the actuator's range."""
@@ -59,10 +55,10 @@ class Rig:
         self.command = min(max(command, info.command_min), info.command_max)
 
     def _step(self, count: int) -> None:
-        self._held[:count] = self.command
-        self._plant.step(self._held[:count], self._read[0, :count], self._read[1, :count])
-        self.displacement_um = float(self._read[0, count - 1])
-        self._samples += count
+        read_um, read = np.empty((2, 1))
+        self._plant.hold(count - 1, self.command)
+        self._plant.step(np.array([self.command]), read_um, read)
+        self.displacement_um = float(read_um[0])
 
 
 class SimulatedWiring(SignalChain):

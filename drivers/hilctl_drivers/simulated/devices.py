@@ -87,6 +87,7 @@ class SimulatedDevice(DacDevice):
     """A :class:`~hilctl.base.device.Device` around a plant; opening it puts the plant at rest."""
 
     Options: ClassVar[type[DeviceOptions]] = SimulatedOptions
+    block_max = FIFO_DEPTH
 
     def __init__(
         self,
@@ -121,9 +122,6 @@ class SimulatedDevice(DacDevice):
         self._next_sample = 0
         self._last_command = 0.0
         self._last_reading_um = 0.0
-
-    def _longest_block(self) -> tuple[int, str]:
-        return FIFO_DEPTH, ""
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Put the plant at rest at the present output, with the sample count at 0."""

@@ -60,7 +60,7 @@ def serve():
 
 
 def line_settings(**changes):
-    return SerialLineSettings(kind="serial", baud=9600, **changes)
+    return SerialLineSettings(**{"kind": "serial", "baud": 9600, **changes})
 
 
 def tcp(port, timeout_s=PATIENT_S):
