@@ -108,10 +108,9 @@ class EmulatedModbus(EmulatedDevice):
     ) -> None:
         super().__init__(profile, bench, output)
         self._sensor = sensor
-        registers = RegisterMap(profile)
-        self.memory = registers.memory
-        self._steps = registers.steps
-        self._outputs, self._inputs = registers.outputs, registers.inputs
+        self.memory = RegisterMap(profile)
+        self._steps = self.memory.steps
+        self._outputs, self._inputs = self.memory.outputs, self.memory.inputs
         watchdog, streaming = profile.watchdog, profile.streaming
         self._watchdog = None if watchdog == "none" else EmulatedWatchdog(watchdog, self._steps)
         if self._watchdog is not None:

@@ -7,10 +7,11 @@ from typing import TypeAlias
 from hilctl_drivers.modbus.modbus_profile import ModbusOutput, ModbusProfile
 from hilctl_drivers.modbus.register_map import (
     ExpectStep,
-    ModbusStep,
+    ModbusSelftest,
     Register,
     RegisterFormat,
     RegisterStep,
+    StatusRegister,
 )
 
 _NO_SUCH_ADDRESS = 2
@@ -65,24 +66,29 @@ _Map: TypeAlias = dict[tuple[str, int], tuple[Words, int]]
 """From area and wire address to a value and the index of its word there."""
 
 
-class RegisterBank:
-    """Addresses in two maps, because couplers read at one address what they do not write there."""
+def _find(places: _Map, areas: Sequence[str], address: int) -> tuple[Words, int]:
+    for area in areas:
+        if (area, address) in places:
+            return places[area, address]
+    raise RejectedRequest(_NO_SUCH_ADDRESS)
 
-    def __init__(self) -> None:
+
+class RegisterMap:
+    """Registers that a profile names, with the values it expects; ``steps`` is by their ``id``.
+
+    Addresses are in two maps, because couplers read at one address what they do not write there.
+    """
+
+    def __init__(self, profile: ModbusProfile) -> None:
+        self._profile = profile
         self._readable: _Map = {}
         self._writable: _Map = {}
-
-    def place(
-        self, words: Words, area: str, address: int, *, read: bool = True, write: bool = True
-    ) -> Words:
-        """Put a value at a wire address, unless there is one already; return the value there."""
-        maps = [self._readable] * read + [self._writable] * write
-        there = next((each[area, address] for each in maps if (area, address) in each), None)
-        found = words if there is None else there[0]
-        for each in maps:
-            for k in range(len(found.words)):
-                each.setdefault((area, address + k), (found, k))
-        return found
+        self.outputs = {name: self._place_output(each) for name, each in profile.outputs.items()}
+        self.inputs = {
+            name: self._place(each, write=False) for name, each in profile.inputs.items()
+        }
+        self.steps: dict[int, Words] = {}
+        self._place_rest()
 
     def read(self, areas: Sequence[str], address: int, count: int) -> list[int]:
         """Return words as they are read, each from the first area that has it."""
@@ -109,26 +115,17 @@ class RegisterBank:
             position += size
         return found
 
-
-def _find(places: _Map, areas: Sequence[str], address: int) -> tuple[Words, int]:
-    for area in areas:
-        if (area, address) in places:
-            return places[area, address]
-    raise RejectedRequest(_NO_SUCH_ADDRESS)
-
-
-class RegisterMap:
-    """Registers that a profile names, with the values it expects; ``steps`` is by their ``id``."""
-
-    def __init__(self, profile: ModbusProfile) -> None:
-        self._profile = profile
-        self.memory = RegisterBank()
-        self.outputs = {name: self._place_output(each) for name, each in profile.outputs.items()}
-        self.inputs = {
-            name: self._place(each, read=True, write=False) for name, each in profile.inputs.items()
-        }
-        self.steps: dict[int, Words] = {}
-        self._place_rest()
+    def _share(
+        self, words: Words, area: str, address: int, *, read: bool = True, write: bool = True
+    ) -> Words:
+        """Put a value at a wire address, unless there is one already; return the value there."""
+        maps = [self._readable] * read + [self._writable] * write
+        there = next((each[area, address] for each in maps if (area, address) in each), None)
+        found = words if there is None else there[0]
+        for each in maps:
+            for k in range(len(found.words)):
+                each.setdefault((area, address + k), (found, k))
+        return found
 
     def _areas(self, register: Register) -> tuple[str, ...]:
         """Return the areas of a register: LabJack does not tell functions 3 and 4 apart."""
@@ -136,45 +133,36 @@ class RegisterMap:
             return (register.area,)
         return ("holding", "input")
 
-    def _place(self, register: Register, *, read: bool, write: bool) -> Words:
-        words = Words(register)
+    def _place(self, register: Register, *, read: bool = True, write: bool = True) -> Words:
         address = self._profile.wire_address(register)
-        first = self.memory.place(words, register.area, address, read=read, write=write)
+        first = self._share(Words(register), register.area, address, read=read, write=write)
         for area in self._areas(register):
-            self.memory.place(first, area, address, read=read, write=False)
+            self._share(first, area, address, read=read, write=False)
         return first
 
     def _place_output(self, output: ModbusOutput) -> Words:
-        words = self._place(output, read=output.readback == "same", write=True)
+        words = self._place(output, read=output.readback == "same")
         readback = output.readback_register
         if readback is not None and readback is not output:
             address = self._profile.wire_address(readback)
             for area in {readback.area, *self._areas(readback)}:
-                self.memory.place(words, area, address, write=False)
+                self._share(words, area, address, write=False)
         return words
 
     def _place_rest(self) -> None:
-        """Place what the profile's steps touch, and the self-test."""
-        profile = self._profile
-        self._place_steps((*profile.init, *profile.close))
-        if profile.selftest != "none":
-            self._place(profile.selftest, read=True, write=False).value = profile.selftest.expect
-        status = [profile.error_register, *(each.validity for each in profile.inputs.values())]
-        for register in status:
-            if register != "none":
-                self.steps[id(register)] = self._place(register, read=True, write=True)
-        if profile.watchdog == "none":
-            return
-        for steps in profile.watchdog.steps().values():
-            self._place_steps(steps)
-        flag = profile.watchdog.tripped
-        if flag != "none":
-            self.steps[id(flag)] = self._place(flag, read=True, write=False)
-
-    def _place_steps(self, steps: tuple[ModbusStep, ...]) -> None:
-        for step in steps:
-            if isinstance(step, RegisterStep):
-                words = self._place(step, read=True, write=not isinstance(step, ExpectStep))
-                self.steps[id(step)] = words
-                if isinstance(step, ExpectStep) and isinstance(step.value, float):
-                    words.words[:] = Words(step).encoded(step.value)
+        """Place the self-test, the status registers, and what the profile's steps touch."""
+        watchdog = self._profile.watchdog
+        flag = None if watchdog == "none" else watchdog.tripped
+        for _, register in self._profile.registers():
+            if isinstance(register, RegisterStep):
+                words = self._place(register, write=not isinstance(register, ExpectStep))
+                if isinstance(register, ExpectStep) and isinstance(register.value, float):
+                    words.words[:] = Words(register).encoded(register.value)
+            elif isinstance(register, ModbusSelftest):
+                words = self._place(register, write=False)
+                words.value = register.expect
+            elif isinstance(register, StatusRegister):
+                words = self._place(register, write=register is not flag)
+            else:
+                continue
+            self.steps[id(register)] = words

@@ -190,12 +190,6 @@ class ModbusWatchdog(Watchdog):
         default="none", description="register that shows a trip"
     )
 
-    def steps(self) -> dict[str, tuple[ModbusStep, ...]]:
-        """Return all steps by dotted key in the profile."""
-        named = {name: getattr(self, name) for name in ("unlock", "arm", "disarm", "feed", "clear")}
-        named |= {f"safe.{output}": steps for output, steps in self.safe.items()}
-        return {f"watchdog.{name}": steps for name, steps in named.items()}
-
     def bound(
         self, steps: tuple[ModbusStep, ...], output: ModbusOutput, timeout_s: float, safe: float
     ) -> tuple[ModbusStep, ...]:

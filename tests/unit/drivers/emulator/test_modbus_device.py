@@ -50,7 +50,7 @@ class Registers:
 
     def write(self, address, value, now_ns):
         words = [value >> 16, value & 0xFFFF]
-        ((target, given),) = self.map.memory.targets("holding", address, words)
+        ((target, given),) = self.map.targets("holding", address, words)
         target.words[:] = given
         self.watchdog.written(target, now_ns)
 
