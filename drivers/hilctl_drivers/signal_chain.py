@@ -27,9 +27,7 @@ PROFILE = "name of a shipped profile, or path of your own relative to the experi
 
 _Channel = TypeVar("_Channel", bound=Range)
 _Value = TypeVar("_Value", float, F64)
-_SENSITIVITIES = {
-    "um_per_v": "V", "um_per_ma": "mA", "um_per_um": "um", "um_per_mm": "mm", "um_per_nm": "nm",
-}  # fmt: skip
+_SENSITIVITIES = {unit: f"um_per_{unit.lower()}" for unit in ("V", "mA", "um", "mm", "nm")}
 _GAINS = ("gain_a_per_v", "gain_a_per_ma", "gain_v_per_v", "gain_v_per_ma")
 
 
@@ -98,13 +96,13 @@ class Sensor(StrictModel):
     @model_validator(mode="after")
     def _one_sensitivity(self) -> Self:
         if len(self._given) > 1 or 0.0 in self._given.values():
-            raise ValueError(f"must have one of {', '.join(_SENSITIVITIES)}, and not 0")
+            raise ValueError(f"must have one of {', '.join(_SENSITIVITIES.values())}, and not 0")
         return self
 
     @property
     def _given(self) -> dict[str, float]:
         """The sensitivity by unit of the input; empty if it is not set."""
-        found = {unit: getattr(self, name) for name, unit in _SENSITIVITIES.items()}
+        found = {unit: getattr(self, name) for unit, name in _SENSITIVITIES.items()}
         return {unit: value for unit, value in found.items() if value is not None}
 
     def um_per_unit(self, source: Range) -> float:
@@ -112,14 +110,12 @@ class Sensor(StrictModel):
         default = source.per_unit("um")
         if not self._given and default is not None:
             return default
+        if source.unit not in _SENSITIVITIES:
+            raise InputError(f"no sensor gives {source.unit}, the unit of the input")
         if source.unit not in self._given:
-            known = {unit: name for name, unit in _SENSITIVITIES.items()}
-            if source.unit not in known:
-                raise InputError(f"no sensor gives {source.unit}, the unit of the input")
-            got = ", ".join(known[unit] for unit in self._given) or "nothing"
-            raise InputError(
-                f"sensor must have {known[source.unit]}: the input is in {source.unit}, got {got}"
-            )
+            got = ", ".join(_SENSITIVITIES[unit] for unit in self._given) or "nothing"
+            wanted = _SENSITIVITIES[source.unit]
+            raise InputError(f"sensor must have {wanted}: the input is in {source.unit}, got {got}")
         return self._given[source.unit]
 
 

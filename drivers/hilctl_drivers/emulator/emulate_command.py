@@ -215,7 +215,7 @@ def emulate(
     ] = False,
 ) -> None:
     """Emulate a device with the simulated rig, until Ctrl-C."""
-    faults = tuple(parse_fault(text) for text in fault or ())
+    wired = None
     if is_experiment(profile):
         own = {"--link": link, "--output": output, "--sensor": sensor, "--reader": reader,
                "--reader-line": reader_line, "--reader-unit-id": reader_unit_id,
@@ -223,33 +223,29 @@ def emulate(
         if given := [name for name, value in own.items() if value is not None]:
             raise InputError(f"{', '.join(given)}: specified by {profile} already")
         wired = wired_experiment(Path(profile), port, host, actuator or ())
-        options = replace(wired.options, log=log, faults=faults, command=command)
-        if reader_port:
-            options = replace(options, reader_port=reader_port)
-        serve(options, partial(_say, as_json=as_json, wired=wired))
-        return
-    if reader is None and sensor is not None and ":" in sensor:
-        reader, _, sensor = sensor.rpartition(":")
-    options = EmulatorOptions(
-        profile=profile,
-        link=link,
-        host=host,
-        port=port,
-        log=log,
-        faults=faults,
-        output=output,
-        sensor=sensor,
-        reader=reader,
-        reader_line=reader_line,
-        reader_unit_id=reader_unit_id,
-        reader_port=reader_port,
-        actuator=_actuator(unit or "A", actuator or ()),
-        command=command,
-    )
-    serve(options, partial(_say, as_json=as_json))
+        options = wired.options
+    else:
+        if reader is None and sensor is not None and ":" in sensor:
+            reader, _, sensor = sensor.rpartition(":")
+        options = EmulatorOptions(
+            profile=profile,
+            link=link,
+            host=host,
+            port=port,
+            output=output,
+            sensor=sensor,
+            reader=reader,
+            reader_line=reader_line,
+            reader_unit_id=reader_unit_id,
+            actuator=_actuator(unit or "A", actuator or ()),
+        )
+    faults = tuple(parse_fault(text) for text in fault or ())
+    reader_port = reader_port or options.reader_port
+    options = replace(options, log=log, faults=faults, command=command, reader_port=reader_port)
+    serve(options, partial(_say, as_json=as_json, wired=wired))
 
 
-def _say(emulator: Emulator, *, as_json: bool, wired: WiredExperiment | None = None) -> None:
+def _say(emulator: Emulator, *, as_json: bool, wired: WiredExperiment | None) -> None:
     if as_json:
         typer.echo(finite_json(_report(emulator, wired)))
         return
