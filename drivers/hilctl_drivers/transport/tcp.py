@@ -51,31 +51,45 @@ def _reset(connection: socket.socket) -> None:
     connection.close()
 
 
-class TcpLink:
-    """A TCP connection for replies with a number, as those of Modbus TCP.
+class _Connection:
+    """A TCP connection; ``timeout_s`` is the longest time to connect, and of one exchange."""
 
-    ``timeout_s`` is the longest time to connect, and of one exchange.
-    """
+    def __init__(self, host: str, port: int, timeout_s: float) -> None:
+        self._host, self._port = host, port  # a numeric address after connecting
+        self._timeout_s = timeout_s
+        self._socket: socket.socket | None = None
+
+    def _connect(self) -> socket.socket:
+        self.close()
+        made, self._host = _connected((self._host, self._port), self._timeout_s)
+        self._socket = made
+        return made
+
+    def close(self) -> None:
+        """Close the connection."""
+        if self._socket is not None:
+            self._socket.close()
+            self._socket = None
+
+
+class TcpLink(_Connection):
+    """A TCP connection for replies with a number, as those of Modbus TCP."""
 
     def __init__(
         self, host: str, port: int, timeout_s: float, clock: Callable[[], float] = time.monotonic
     ) -> None:
-        self._host, self._port = host, port  # a numeric address after connecting
-        self._timeout_s = timeout_s
+        super().__init__(host, port, timeout_s)
         self._clock = clock
-        self._socket: socket.socket | None = None
 
     def open(self) -> None:
         """Connect, see :meth:`~hilctl_drivers.transport.links.Link.open`."""
-        self.close()
-        made, self._host = _connected((self._host, self._port), self._timeout_s)
+        made = self._connect()
         made.settimeout(None)
         # The kernel's own time-outs spare the poll() before each call that Python's would cost.
         seconds, fraction = divmod(self._timeout_s, 1.0)
         limit = struct.pack("ll", int(seconds), max(1, int(fraction * 1e6)))
         made.setsockopt(socket.SOL_SOCKET, socket.SO_RCVTIMEO, limit)
         made.setsockopt(socket.SOL_SOCKET, socket.SO_SNDTIMEO, limit)
-        self._socket = made
 
     def transact(
         self, request: bytes | bytearray, missing: Missing, usual: int = 0
@@ -133,33 +147,19 @@ class TcpLink:
         """Close the connection: the next one has no late replies."""
         self.close()
 
-    def close(self) -> None:
-        """Close the connection."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
 
+class TcpReceiver(_Connection):
+    """A TCP connection on which only the device sends."""
 
-class TcpReceiver:
-    """A TCP connection on which only the device sends.
-
-    ``timeout_s`` is the longest time to connect.
-    """
-
-    def __init__(self, host: str, port: int, timeout_s: float) -> None:
-        self._address = (host, port)
-        self._timeout_s = timeout_s
-        self._socket: socket.socket | None = None
-        self._looked_ns = 0
+    _looked_ns = 0
 
     def open(self) -> None:
         """Connect; raise LostError if no device answers."""
-        self.close()
         self._looked_ns = time.monotonic_ns()
-        self._socket, _ = _connected(self._address, self._timeout_s)
-        self._socket.setblocking(False)
+        made = self._connect()
+        made.setblocking(False)
         try:
-            self._socket.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
+            made.setsockopt(socket.SOL_SOCKET, _SO_TIMESTAMPNS, 1)
         except OSError as error:  # reset since
             raise LostError(f"connection lost: {why(error)}") from None
 
@@ -198,12 +198,6 @@ class TcpReceiver:
             raise LostError(f"connection lost: {why(error)}") from None
         age_ns = max(0, time.time_ns() - arrived_ns)
         return received, min(age_ns, time.monotonic_ns() - looked_ns)
-
-    def close(self) -> None:
-        """Close the connection."""
-        if self._socket is not None:
-            self._socket.close()
-            self._socket = None
 
 
 class TcpStream(StreamLink):
