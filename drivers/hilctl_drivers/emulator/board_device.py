@@ -11,15 +11,9 @@ from hilctl_drivers.board.board_profile import FrameProfile, FrameStreaming
 from hilctl_drivers.board.board_session import BoardValues
 from hilctl_drivers.board.frames import Status
 from hilctl_drivers.emulator.rig import Bench, SampleFifo
-from hilctl_drivers.emulator.wire import EmulatedReply, SerialDevice
+from hilctl_drivers.emulator.wire import EmulatedReply, RejectedRequest, SerialDevice
 
 _GOOD = b"\0"
-
-
-class _Refuse(Exception):  # noqa: N818  a reply, not a mistake
-    def __init__(self, status: Status) -> None:
-        super().__init__(status)
-        self.status = status
 
 
 class EmulatedBoard(SerialDevice):
@@ -80,8 +74,8 @@ class EmulatedBoard(SerialDevice):
         self._head = head = bytes([message[0] | board.REPLY_BIT, message[1]])
         try:
             reply = self._kinds[message[0]](message[board.HEAD.size :])
-        except _Refuse as refused:
-            return self.refusal(message, refused.status)
+        except RejectedRequest as refused:
+            return self.refusal(message, refused.code)
         return EmulatedReply(head + _GOOD + reply) if isinstance(reply, bytes) else reply
 
     def refusal(self, message: bytes, status: int = Status.BAD_MESSAGE) -> EmulatedReply:
@@ -101,18 +95,18 @@ class EmulatedBoard(SerialDevice):
     def _values(self, data: bytes, count: int = 1) -> F64:
         """Return the values of a message, all good."""
         if count < 1 or len(data) != count * self._outputs.size:
-            raise _Refuse(Status.BAD_MESSAGE)
+            raise RejectedRequest(Status.BAD_MESSAGE)
         values = self._outputs.decode(data)
         low, high = self._range.limits
         slack = 1e-6 * (high - low)  # a float32 is that coarse
         if not ((values >= low - slack) & (values <= high + slack)).all():
-            raise _Refuse(Status.OUT_OF_RANGE)
+            raise RejectedRequest(Status.OUT_OF_RANGE)
         return values
 
     def _exchange(self, body: bytes) -> bytes:
         count, data = body[: board.EXCHANGE_FIELDS.size], body[board.EXCHANGE_FIELDS.size :]
         if count != b"\1\0" or self.fifo.running:
-            raise _Refuse(Status.BAD_MESSAGE)
+            raise RejectedRequest(Status.BAD_MESSAGE)
         (value,) = self._values(data)
         self._refuse_if_tripped()
         reading = self._at_terminal(np.array([self._rig.displacement_um]))
@@ -121,21 +115,21 @@ class EmulatedBoard(SerialDevice):
 
     def _refuse_if_tripped(self) -> None:
         if self.tripped:
-            raise _Refuse(Status.TRIPPED)
+            raise RejectedRequest(Status.TRIPPED)
 
     def _stream(self, body: bytes) -> EmulatedReply:
         size, fifo, streaming = board.STREAM_FIELDS.size, self.fifo, self._streaming
         if len(body) < size or streaming is None:
-            raise _Refuse(Status.BAD_MESSAGE)
+            raise RejectedRequest(Status.BAD_MESSAGE)
         first, count = board.STREAM_FIELDS.unpack_from(body)
         values = self._values(body[size:], count)
         self._refuse_if_tripped()
         if not fifo.running or count > streaming.block_max:
-            raise _Refuse(Status.BAD_MESSAGE)
+            raise RejectedRequest(Status.BAD_MESSAGE)
         if first != self.queued & 0xFFFFFFFF:
-            raise _Refuse(Status.WRONG_FIRST)
+            raise RejectedRequest(Status.WRONG_FIRST)
         if fifo.level + count > streaming.fifo_depth:
-            raise _Refuse(Status.FIFO_FULL)
+            raise RejectedRequest(Status.FIFO_FULL)
         fifo.queue(self.wiring.command(values))
         if not fifo.started and fifo.level >= self._prefill:
             fifo.start(self._now_ns)
@@ -160,7 +154,7 @@ class EmulatedBoard(SerialDevice):
     def _watchdog(self, body: bytes) -> bytes:
         size = board.WATCHDOG_FIELDS.size
         if len(body) < size or self.profile.watchdog == "none":
-            raise _Refuse(Status.BAD_MESSAGE)
+            raise RejectedRequest(Status.BAD_MESSAGE)
         (timeout_ms,) = board.WATCHDOG_FIELDS.unpack_from(body)
         self._safe = float(self._values(body[size:])[0])
         self._timer.timeout_ns = timeout_ms * 1_000_000
@@ -192,7 +186,7 @@ class EmulatedBoard(SerialDevice):
 
     def _state(self, body: bytes) -> bytes:
         if body:
-            raise _Refuse(Status.BAD_MESSAGE)
+            raise RejectedRequest(Status.BAD_MESSAGE)
         output = self._outputs.encode(np.array([self.wiring.output(self.fifo.command)]))
         read_um = self._played_um if self.fifo.started else self._rig.displacement_um
         reading = self._inputs.encode(self._at_terminal(np.array([read_um])))
@@ -200,11 +194,11 @@ class EmulatedBoard(SerialDevice):
 
     def _clock(self, body: bytes) -> bytes:
         if len(body) != board.CLOCK_REQUEST.size or self._streaming is None:
-            raise _Refuse(Status.BAD_MESSAGE)
+            raise RejectedRequest(Status.BAD_MESSAGE)
         rate_hz, prefill = board.CLOCK_REQUEST.unpack(body)
         too_fast = not 0.0 <= rate_hz <= self.profile.max_rate_hz * (1.0 + 1e-6)
         if too_fast or prefill > self._streaming.fifo_depth or not math.isfinite(rate_hz):
-            raise _Refuse(Status.BAD_MESSAGE)
+            raise RejectedRequest(Status.BAD_MESSAGE)
         self._prefill = prefill
         self._stop()
         if rate_hz > 0.0:

@@ -10,8 +10,8 @@ from collections.abc import Callable, Sequence
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl_drivers.emulator.registers import RejectedRequest
 from hilctl_drivers.emulator.rig import Bench, SampleFifo
+from hilctl_drivers.emulator.wire import RejectedRequest
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.modbus.modbus_profile import BYTES_A_SAMPLE, LabJackStreaming, ModbusProfile
 from hilctl_drivers.modbus.register_map import RegisterStep

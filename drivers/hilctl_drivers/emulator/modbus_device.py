@@ -4,8 +4,9 @@ from collections.abc import Sequence
 
 from hilctl.base.types import F64
 from hilctl_drivers.emulator.labjack_stream import LabJackStream
-from hilctl_drivers.emulator.registers import RegisterMap, RejectedRequest, Words
+from hilctl_drivers.emulator.registers import RegisterMap, Words
 from hilctl_drivers.emulator.rig import Bench, EmulatedDevice, WatchdogTimer
+from hilctl_drivers.emulator.wire import RejectedRequest
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile, ModbusWatchdog
 from hilctl_drivers.modbus.register_map import EnsureStep, ModbusStep, RegisterStep, WriteStep
 

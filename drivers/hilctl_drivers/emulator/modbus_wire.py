@@ -15,8 +15,7 @@ from pymodbus.framer import FramerRTU, FramerSocket
 from pymodbus.pdu import DecodePDU, ExceptionResponse, ModbusPDU
 
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
-from hilctl_drivers.emulator.registers import RejectedRequest
-from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
+from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire, RejectedRequest
 
 _CORRUPT_AT = 3  # the protocol id (TCP), data (RTU)
 

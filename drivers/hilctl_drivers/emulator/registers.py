@@ -4,6 +4,7 @@ import struct
 from collections.abc import Sequence
 from typing import TypeAlias
 
+from hilctl_drivers.emulator.wire import RejectedRequest
 from hilctl_drivers.modbus.modbus_profile import ModbusOutput, ModbusProfile
 from hilctl_drivers.modbus.register_map import (
     ExpectStep,
@@ -15,14 +16,6 @@ from hilctl_drivers.modbus.register_map import (
 )
 
 _NO_SUCH_ADDRESS = 2
-
-
-class RejectedRequest(Exception):  # noqa: N818  a reply, not a mistake
-    """The device refuses a request with a Modbus exception ``code``."""
-
-    def __init__(self, code: int) -> None:
-        super().__init__(f"exception {code}")
-        self.code = code
 
 
 class Words:

@@ -29,6 +29,14 @@ class EmulatedReply:
     wrong_id: Callable[[bytes], bytes] | None = None  # returns it in another's name, for a fault
 
 
+class RejectedRequest(Exception):  # noqa: N818  a reply, not a mistake
+    """The device refuses a request with a Modbus exception or a board's status, ``code``."""
+
+    def __init__(self, code: int) -> None:
+        super().__init__(f"exception {code}")
+        self.code = code
+
+
 SerialProfile: TypeAlias = AsciiProfile | FrameProfile
 
 

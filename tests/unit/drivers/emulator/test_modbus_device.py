@@ -3,7 +3,8 @@
 import pytest
 
 from hilctl_drivers.emulator.modbus_device import EmulatedWatchdog
-from hilctl_drivers.emulator.registers import RegisterMap, RejectedRequest
+from hilctl_drivers.emulator.registers import RegisterMap
+from hilctl_drivers.emulator.wire import RejectedRequest
 from hilctl_drivers.profile import load_profile
 from tests.unit.drivers.emulator.conftest import emulated_modbus
 

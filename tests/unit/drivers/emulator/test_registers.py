@@ -2,7 +2,8 @@
 
 import pytest
 
-from hilctl_drivers.emulator.registers import RegisterMap, RejectedRequest, Words
+from hilctl_drivers.emulator.registers import RegisterMap, Words
+from hilctl_drivers.emulator.wire import RejectedRequest
 from hilctl_drivers.modbus.register_map import Register
 from hilctl_drivers.profile import load_profile
 
