@@ -53,21 +53,14 @@ def shipped_profiles() -> dict[str, Path]:
     return {path.stem: path for path in sorted(FOLDER.glob("*.yaml"))}
 
 
-def load_profile(
-    name_or_path: str, files: TextFiles | None = None, folder: Path | None = None
-) -> BaseProfile:
-    """Return a profile by the name of a shipped one, or by path.
-
-    Args:
-        name_or_path: The name, or the path, which has a slash or the suffix of YAML.
-        files: Reads the text; from the disk if None.
-        folder: Base of a relative path; the working folder if None.
+def load_profile(name_or_path: str) -> BaseProfile:
+    """Return a profile by the name of a shipped one, or by path: with a slash or suffix of YAML.
 
     Raises:
         InputError: There is no such profile, or the file cannot be read.
         ConfigError: It breaks rules; all are listed.
     """
-    return _load(name_or_path, files, folder).profile
+    return _load(name_or_path, None, None).profile
 
 
 def _load(name_or_path: str, files: TextFiles | None, folder: Path | None) -> NamedProfile:

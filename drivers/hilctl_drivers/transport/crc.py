@@ -55,12 +55,12 @@ def _reflected_table(poly: int) -> tuple[int, ...]:
 _MODBUS = _reflected_table(0xA001)
 
 
-def crc16_modbus(data: Bytes, start: int = 0xFFFF) -> int:
+def crc16_modbus(data: Bytes) -> int:
     """Return the CRC of a Modbus RTU message; sent least significant byte first.
 
-    It is 0 over a message with its CRC. ``start`` is the CRC of the bytes before ``data``.
+    It is 0 over a message with its CRC.
     """
-    crc = start
+    crc = 0xFFFF
     for byte in data:
         crc = crc >> 8 ^ _MODBUS[(crc ^ byte) & 0xFF]
     return crc
