@@ -103,7 +103,7 @@ class WiredDac(DacDevice):
             self._run_feed_steps()
 
     def _run_feed_steps(self) -> None:
-        """Feed the watchdog."""
+        """Run the steps that feed the watchdog, if it has any."""
 
     def _output(self) -> float | None:
         held = self._held()
