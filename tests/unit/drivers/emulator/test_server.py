@@ -13,7 +13,7 @@ from pymodbus.client import ModbusTcpClient
 
 from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.emulator.server import EmulatorServer
-from hilctl_drivers.emulator.wire import EmulatedReply
+from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
 from hilctl_drivers.modbus.pdu import read_pdu, tcp_adu, write_pdu
 from hilctl_drivers.modbus.register_map import RegisterFormat
 from tests.fakes import logged, received
@@ -47,14 +47,11 @@ def test_log_tells_time_and_value(served, tmp_path):
     assert entry["unix_s"] > 1.7e9
 
 
-class EchoWire:
+class EchoWire(EmulatedWire):
     """A wire whose requests are single bytes; each is answered by itself, 10 ms later if late."""
 
     def __init__(self, *, late=False, size=1):
         self._late, self._size = late, size
-
-    def tick(self, now_ns):
-        pass
 
     def requests(self, received):
         while received:
@@ -65,12 +62,6 @@ class EchoWire:
 
     def refusal(self, request):
         return EmulatedReply(b"!")
-
-    def encode(self, data):
-        return data
-
-    def corrupt_at(self, framed):
-        return 0
 
 
 class Served:
