@@ -266,21 +266,17 @@ class ModbusProfile(BaseProfile):
                     f"{where}.address must be in area {register.area} with address_base {base},"
                     f" got {register.address}"
                 )
-        for first, second in combinations((*self.outputs.items(), *self.inputs.items()), 2):
-            self._check_apart(first, second)
+        channels = (*self.outputs.items(), *self.inputs.items())
+        for (name, one), (other, two) in combinations(channels, 2):
+            at, behind = self.wire_address(one), self.wire_address(two)
+            alike = (at, one.words) == (behind, two.words)
+            overlap = at < behind + two.words and behind < at + one.words
+            if one.area == two.area and overlap and not alike:
+                raise ValueError(f"the registers of {name} and {other} overlap: {at} and {behind}")
         for name, channel in self.inputs.items():
             if self.exchange == 23 and channel.area != "holding":
                 raise ValueError(f"inputs.{name}.area must be holding: exchange 23 reads holding")
         return self
-
-    def _check_apart(self, *channels: tuple[str, Register]) -> None:
-        """Refuse two channels that share some of their registers, but not all."""
-        (name, one), (other, two) = channels
-        at, behind = self.wire_address(one), self.wire_address(two)
-        if one.area != two.area or (at, one.words) == (behind, two.words):
-            return
-        if at < behind + two.words and behind < at + one.words:
-            raise ValueError(f"the registers of {name} and {other} overlap: {at} and {behind}")
 
     @model_validator(mode="after")
     def _placeholders(self) -> Self:
