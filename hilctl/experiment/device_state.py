@@ -181,19 +181,24 @@ class _Followed:
         """Unix time of its end in s, known after all commands were read."""
 
     def commands(self) -> Iterator[F64]:
-        """Yield the commands in order, then the safe value."""
+        """Yield the commands in order, then the safe value; skipped ticks held the output."""
         from hilctl.recording.reader import RecordingStream  # slow to import, rarely needed
 
-        samples, whole, unanswered = 0, True, False
+        samples, held, last, whole, unanswered = 0, 0, 0.0, True, False
         for piece in RecordingStream(self._path):
             self._check(piece)
-            index, flags = piece.samples.index, piece.samples.flags
+            index, flags, command = piece.samples.index, piece.samples.flags, piece.samples.command
             unanswered |= bool(np.any(flags & Flag.UNANSWERED.value))
-            stop = samples + index.size
-            whole &= not index.size or (index[0] == samples and index[-1] + 1 == stop)
-            samples = stop
-            yield piece.samples.command
-        if not (whole and samples and piece.end) or piece.dropped:
+            if not index.size:
+                continue
+            gaps = np.diff(index, prepend=samples - 1) - 1
+            skipped = bool(np.all(flags[gaps > 0] & Flag.AFTER_SKIPPED.value))
+            whole &= skipped and (samples > 0 or index[0] == 0)
+            held += int(gaps.sum())
+            yield np.full(gaps[0], last)
+            yield np.repeat(command, 1 + np.append(gaps[1:], 0))
+            samples, last = int(index[-1]) + 1, float(command[-1])
+        if not (whole and samples and piece.end) or piece.dropped > held:
             raise DataError(f"{self._path}: is incomplete: the state of the actuator is unknown")
         if unanswered or piece.end.get("output_safe") == "false":
             lost = "lost its device, or did not confirm its safe value"

@@ -47,8 +47,8 @@ LATER_S = datetime.fromisoformat("2026-01-01T00:01:00+00:00").timestamp()
 COMMAND = 4.0 * np.sin(np.pi * np.arange(1000) / 999.0)
 
 
-def record(path, command, *, first=0, flags=0, facts=None, **made):
-    """Write a run of these commands without a compensator."""
+def record(path, command, *, first=0, skipped=0, flags=0, facts=None, **made):
+    """Write a run of these commands without a compensator, with ticks skipped in the middle."""
     blocks = command.size // BLOCK
     batch = BlockBatch.empty(blocks, BLOCK, 1)
     batch.heads[:, BlockHeader.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
@@ -56,6 +56,10 @@ def record(path, command, *, first=0, flags=0, facts=None, **made):
     batch.heads[0, BlockHeader.DROPPED_BEFORE] = first
     batch.columns[:, list(COLUMNS).index("command")] = command.reshape(blocks, BLOCK)
     batch.flags[-1, -1] = flags
+    if skipped:
+        batch.heads[blocks // 2 :, BlockHeader.FIRST_SAMPLE] += skipped
+        batch.heads[blocks // 2, BlockHeader.DROPPED_BEFORE] = skipped
+        batch.flags[blocks // 2] |= Flag.AFTER_SKIPPED.value
     return write_recording(path, batch, facts={"run_id": "before", **(facts or {})}, **made)
 
 
@@ -159,6 +163,16 @@ def test_lead_in_of_a_run_that_is_shorter():
     assert np.all(np.diff(led) < 0.0)
     assert led.size == 10
     assert not fed.any()
+
+
+def test_the_output_is_held_in_skipped_ticks(tmp_path):
+    blocks = COMMAND.size // BLOCK
+    head, tail = COMMAND[: blocks // 2 * BLOCK], COMMAND[blocks // 2 * BLOCK :]
+    held = np.concatenate((head, np.full(BLOCK, head[-1]), tail))
+    left = state_after(record(tmp_path / "skipped.mcap", COMMAND, skipped=BLOCK), STAGED)
+    whole = state_after(record(tmp_path / "whole.mcap", held), STAGED)
+    assert left.stands_um == whole.stands_um
+    np.testing.assert_array_equal(left.state, whole.state)
 
 
 @pytest.mark.parametrize(("model", "rate_hz", "made", "message"), [
