@@ -12,6 +12,7 @@ PUBLIC = (
     "report_table",
     "run_metrics",
     "response.bode",
+    "response.feedback_design",
     "response.frequency_response",
     "response.step_response",
     "run_page",

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from hilctl.api.connection import RunConnection, connect
     from hilctl.api.models import LoadedModel, compare, export_model, identify, load_model, refine
     from hilctl.api.recordings import RecordedRun, export, list_runs, read, summarize
-    from hilctl.api.reports import figures, frf, replay, report_page, report_runs, step
+    from hilctl.api.reports import figures, frf, replay, report_page, report_runs, step, tune
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
     from hilctl.api.tables import RunTable, SampleTable
 
@@ -80,6 +80,7 @@ __all__ = [
     "run",
     "step",
     "summarize",
+    "tune",
 ]
 
 
@@ -106,7 +107,7 @@ if not TYPE_CHECKING:
             "load_model",
             "refine",
         },
-        "reports": {"figures", "frf", "replay", "report_page", "report_runs", "step"},
+        "reports": {"figures", "frf", "replay", "report_page", "report_runs", "step", "tune"},
         "runs": {"WrittenExperiment", "check", "init", "load", "run"},
         "tables": {"RunTable", "SampleTable"},
     }

@@ -11,6 +11,11 @@ from hilctl.analysis.figure_layout import FigureSpec, formats_of
 from hilctl.analysis.replay import ReplayResult
 from hilctl.analysis.replay import replay as recompute
 from hilctl.analysis.response.bode import write_responses
+from hilctl.analysis.response.feedback_design import (
+    FeedbackDesign,
+    design_feedback,
+    write_design,
+)
 from hilctl.analysis.response.frequency_response import (
     FrequencyResponse,
     Signals,
@@ -24,6 +29,7 @@ from hilctl.api._types import PathLike, Paths, paths_of
 from hilctl.api.recordings import RecordedRun, read, stream_of
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable
+from hilctl.experiment.open_loop import write_response
 from hilctl.models.model_file import load_model
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.studies.multi_run.collect import RunSeries, collect
@@ -115,6 +121,39 @@ def step(run: RecordedRun | PathLike, *, band_percent: float = SETTLED_PERCENT) 
     """
     recorded = run if isinstance(run, RecordedRun) else read(run)
     return measured_step(recorded.recording, band_percent)
+
+
+def tune(
+    run: RecordedRun | PathLike,
+    output: PathLike | None = None,
+    html: PathLike | None = None,
+    *,
+    overwrite: bool = False,
+) -> FeedbackDesign:
+    """Return a feedback with gain and phase margin for a run's response through its compensator.
+
+    Args:
+        run: Recording in memory, or a file: a multisine, random, chirp, or sines in sequence, with
+            or without feedback.
+        output: File for the measured response, which ``feedback.response`` of an experiment names.
+        html: Page with a Bode plot to write, if any.
+        overwrite: Replace existing files.
+
+    Raises:
+        InputError: The file does not exist, the run has no compensator, its response ends too
+            early, or a file cannot be written.
+        DataError: The file is not a recording, or has no frequency response above the noise.
+    """
+    for each in (output, html):
+        if each is not None:
+            check_writable(Path(each), overwrite=overwrite)
+    recorded = run if isinstance(run, RecordedRun) else read(run)
+    design = design_feedback(recorded.recording, None if output is None else str(output))
+    if output is not None:
+        write_response(Path(output), design.response, overwrite=overwrite)
+    if html is not None:
+        write_design(design, Path(html))
+    return design
 
 
 def report_runs(

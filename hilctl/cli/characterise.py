@@ -1,4 +1,4 @@
-"""Commands that measure an actuator: characterise, frf, step."""
+"""Commands that measure an actuator: characterise, frf, step, tune."""
 
 import shlex
 import signal
@@ -11,6 +11,8 @@ from rich.console import Group
 
 from hilctl import api
 from hilctl.analysis.response.bode import fit_rows, line_table
+from hilctl.analysis.response.feedback_design import FeedbackDesign
+from hilctl.analysis.response.feedback_design import figure_rows as loop_rows
 from hilctl.analysis.response.frequency_response import FrequencyResponse, Signals
 from hilctl.analysis.response.step_response import SETTLED_PERCENT, StepResponse
 from hilctl.api._types import runs_folder
@@ -213,6 +215,33 @@ def step(
     """Measure the response to the largest step: rise, settling, overshoot, ringing."""
     found = api.step(recording, band_percent=band_percent)
     print_result(found.to_mapping(), lambda: print_rich(render_step(found)), as_json=as_json)
+
+
+def tune(
+    recording: RecordingFile,
+    output: Annotated[
+        Path | None,
+        typer.Option(
+            metavar="FILE", help="File for the measured response, for feedback.response to name."
+        ),
+    ] = None,
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="HTML page with a Bode plot to write.")
+    ] = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Propose the feedback's gain from a measured response, with its margins."""
+    found = api.tune(recording, output, html, overwrite=overwrite)
+    print_result(found.to_mapping(), lambda: print_design(found, output), as_json=as_json)
+
+
+def print_design(design: FeedbackDesign, output: Path | None) -> None:
+    """Print the margins and the section to paste."""
+    print_rich(table(str(design.path), *loop_rows(design)))
+    print(design.to_yaml(), end="")
+    if output is None:
+        print("# add --output FILE and set response: FILE, so that check uses this response")
 
 
 def render_step(found: StepResponse) -> Group:

@@ -72,6 +72,7 @@ _MODULES = {
         "then identify and validate a model.",
         "frf": "Measure the frequency response of runs: gain, phase, coherence, resonance.",
         "step": "Measure the response to the largest step: rise, settling, overshoot, ringing.",
+        "tune": "Propose the feedback's gain from a measured response, with its margins.",
     },
     "hilctl.cli.campaigns": {
         "campaign": "Run an experiment with each combination of varied keys "

@@ -248,7 +248,7 @@ def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment
         return None
     document = Document(f"{recording.path} (experiment)", recording.experiment_yaml)
     hold = f"{{kind: hold, unit: {recording.command_unit}, level: 0.0, duration_s: 1.0}}"
-    plain = ("compensator=none", f"waveform={hold}")
+    plain = ("compensator=none", "feedback=null", f"waveform={hold}")
     return resolve(document, recording.path.parent, (*plain, *settings))
 
 

@@ -7,6 +7,7 @@ preflight.py      the check of an experiment: all rules and the complete command
 device_rules.py   rules between an experiment and its device
 conditioning.py   rules and commands of the ``condition`` section
 closed_loop.py    rules and settings of the ``feedback`` and ``adaptation`` sections
+open_loop.py      open loop of the feedback and its margins, from a measured or assumed response
 model_validity.py comparison of the reference with the motions the model was identified on
 forecast.py       the commands of a run in numbers
 device_state.py   the last run of each device, and the initial state of the compensator
@@ -18,7 +19,7 @@ examples.py       shipped examples and copies of them
 
 PUBLIC = (
     "closed_loop", "coil_heat", "conditioning", "correction", "device_rules", "device_state",
-    "devices", "examples", "file", "forecast", "load", "model_validity", "preflight", "sections",
-    "template",
+    "devices", "examples", "file", "forecast", "load", "model_validity", "open_loop", "preflight",
+    "sections", "template",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -4,30 +4,36 @@ Behind the compensator the actuator is a gain of about 1 with a delay, so the de
 the sample rate, limits the bandwidth.
 """
 
-import cmath
 import math
 from collections.abc import Callable, Iterator
 from dataclasses import replace
 
 import numpy as np
 
-from hilctl.base.errors import ConfigProblem
+from hilctl.base.errors import ConfigProblem, InputError
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.experiment.sections import IntegralFeedbackConfig, PiFeedbackConfig
+from hilctl.experiment.open_loop import (
+    ASSUMED_PHASE_MARGIN_DEG,
+    LEAST_GAIN_MARGIN_DB,
+    LEAST_PHASE_MARGIN_DEG,
+    Exchange,
+    LoopResponse,
+    assumed_response,
+)
+from hilctl.experiment.sections import AnyFeedbackConfig, IntegralFeedbackConfig, PiFeedbackConfig
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Controller, Feedback, Gains, IntegralFeedback
+from hilctl.models.linear_stages import FirstMode
 from hilctl.waveforms.build import Reference
 
 LOOP_DELAY = 2
 """Samples from a correction to the first tick that sees its effect: one until the sensor shows it,
 and one until the displacement from that exchange is used."""
 
-LEAST_GAIN_MARGIN = 2.0
-LEAST_PHASE_MARGIN_DEG = 60.0
 SLOW_SHARE = 0.2
 """Bandwidth of an integrator of block means, as a share of 1 / (2 pi delay): phase margin 79
 degrees, gain margin nearly 8, enough for an actual gain several times that of the model, as on
@@ -35,8 +41,6 @@ small loops."""
 UNKNOWN_RESONANCE_HZ = 5.0
 """Highest bandwidth of such an integrator without a known resonance: gain margin 2 for any above
 500 Hz with a damping of 1 %."""
-_FREQUENCIES = 4096
-_HIGHEST_RATE_HZ = 1e6
 
 
 def make_feedback(
@@ -48,11 +52,10 @@ def make_feedback(
         return None
     rate_hz = config.sample_rate_hz
     due_after, shown_after = delays(wanted.sensor_delay_s, rate_hz, compensator.preview)
+    gains = feedback_gains(wanted, rate_hz)
     if isinstance(wanted, IntegralFeedbackConfig):
-        gain = 2.0 * math.pi * wanted.bandwidth_hz * config.tick_s
         blocks = latency_blocks + LOOP_DELAY + math.ceil(shown_after / config.block)
-        return IntegralFeedback(gain, wanted.limit_um, due_after, blocks)
-    gains = _gains(wanted, rate_hz)
+        return IntegralFeedback(gains.ki_per_s * config.tick_s, wanted.limit_um, due_after, blocks)
     return Feedback(gains, rate_hz, wanted.limit_um, due_after, shown_after + LOOP_DELAY)
 
 
@@ -70,10 +73,12 @@ def feedback_problems(loaded: LoadedExperiment, preview: int) -> Iterator[Config
         return
     if config.compensator is None:
         yield loaded.problem("feedback", "needs a compensator, whose input it corrects")
-    if isinstance(wanted, IntegralFeedbackConfig):
-        yield from _slow_problems(loaded, wanted, preview)
-    else:
+    if loaded.response is not None:
+        yield from _measured_problems(loaded, wanted)
+    if isinstance(wanted, PiFeedbackConfig):
         yield from _fast_problems(loaded, wanted, preview)
+    elif loaded.response is None:
+        yield from _slow_problems(loaded, wanted, preview)
 
 
 def _fast_problems(
@@ -86,10 +91,56 @@ def _fast_problems(
         yield loaded.problem("feedback", rule, hint=hint)
     if config.block > 1:
         yield loaded.problem("block", "must be 1 with PI feedback", str(config.block), hint)
-    if not (info.latency_blocks or config.block > 1 or config.compensator is None):
-        delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
-        yield from _gain_problems(loaded, wanted, delay_s)
-        yield from _resonance_problems(loaded, wanted)
+    if info.latency_blocks or config.block > 1 or config.compensator is None or wanted.response:
+        return
+    resonance = _resonance(loaded, wanted)
+    if resonance is None:
+        rule = "needs resonance_hz and damping_ratio of the actuator with its load"
+        hint = "feedback excites it; or measure it with 'hilctl tune', and set response"
+        yield loaded.problem("feedback", rule, hint=hint)
+        return
+    delay_s = wanted.sensor_delay_s + max(0, preview - 1) / config.sample_rate_hz
+    assumed = assumed_response(config.sample_rate_hz, delay_s, resonance)
+    loop = assumed.controlled(feedback_gains(wanted, config.sample_rate_hz), exchange_of(loaded))
+    yield from _margin_problems(loaded, wanted, loop, ASSUMED_PHASE_MARGIN_DEG)
+
+
+def _measured_problems(
+    loaded: LoadedExperiment, wanted: AnyFeedbackConfig
+) -> Iterator[ConfigProblem]:
+    """Check the margins with the measured response."""
+    assert loaded.response is not None
+    gains = feedback_gains(wanted, loaded.config.sample_rate_hz)
+    try:
+        loaded.response.check_model(loaded.model)
+        loop = loaded.response.open_loop(gains, exchange_of(loaded))
+    except InputError as error:
+        hint = "measure again, and use 'hilctl tune' on the recording"
+        yield loaded.problem("feedback.response", str(error), hint=hint)
+        return
+    yield from _margin_problems(loaded, wanted, loop, LEAST_PHASE_MARGIN_DEG)
+
+
+def _margin_problems(
+    loaded: LoadedExperiment, wanted: AnyFeedbackConfig, loop: LoopResponse, phase_margin_deg: float
+) -> Iterator[ConfigProblem]:
+    """Yield that an open loop lacks its margins, with the gain that has them."""
+    if loop.holds(phase_margin_deg):
+        return
+    gain_db, phase_deg = loop.margins
+    rule = (
+        f"must leave a gain margin of {LEAST_GAIN_MARGIN_DB:g} dB and a phase margin of "
+        f"{phase_margin_deg:g} degrees"
+    )
+    value = f"{gain_db:.3g} dB and {phase_deg:.3g} degrees"
+    room, rate_hz = loop.room(phase_margin_deg), loaded.config.sample_rate_hz
+    gains = feedback_gains(wanted, rate_hz)
+    key, hint = "feedback", f"multiply its gains by at most {rounded_down(room):g}"
+    if wanted.bandwidth_hz is not None:
+        key = "feedback.bandwidth_hz"
+        highest_hz = bandwidth_of(wanted.kind, room * gains.ki_per_s, rate_hz)
+        hint = f"at most {rounded_down(highest_hz):g} Hz; a higher rate may allow more"
+    yield loaded.problem(key, rule, value, hint)
 
 
 def _slow_problems(
@@ -101,101 +152,44 @@ def _slow_problems(
     delay_s = (info.latency_blocks + 1) * config.tick_s + shown_s
     highest_hz = SLOW_SHARE / (2.0 * math.pi * delay_s)
     rule = f"must be <= {highest_hz:.4g} Hz by the delay of the loop, {delay_s:.3g} s"
-    natural_hz, damping = _resonance(loaded, wanted)
+    resonance = _resonance(loaded, wanted)
     hint = "a smaller block or a higher rate shortens the delay"
-    if natural_hz is not None and damping is not None:
-        if damping * natural_hz < highest_hz:
-            highest_hz = damping * natural_hz
+    if resonance is not None:
+        if resonance.damping_ratio * resonance.natural_hz < highest_hz:
+            highest_hz = resonance.damping_ratio * resonance.natural_hz
             rule = f"must be <= {highest_hz:.4g} Hz, damping times natural frequency"
-            hint = f"the gain at {natural_hz:g} Hz must be at most {1.0 / LEAST_GAIN_MARGIN:g}"
+            hint = f"the gain at {resonance.natural_hz:g} Hz must be at most 0.5"
     elif highest_hz > UNKNOWN_RESONANCE_HZ:
         highest_hz = UNKNOWN_RESONANCE_HZ
         rule = f"must be <= {highest_hz:g} Hz without a known resonance"
-        hint = "set resonance_hz and damping_ratio of the actuator with its load"
+        hint = "set resonance_hz and damping_ratio of the actuator with its load, or response"
     if wanted.bandwidth_hz > highest_hz:
         yield loaded.problem("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)
 
 
-def _gains(wanted: PiFeedbackConfig, rate_hz: float) -> Gains:
-    if wanted.bandwidth_hz is not None:
-        return gains_for(min(wanted.bandwidth_hz, 0.5 * rate_hz), rate_hz)
-    return Gains(wanted.kp or 0.0, wanted.ki_per_s or 0.0)
+def feedback_gains(wanted: AnyFeedbackConfig, rate_hz: float) -> Gains:
+    """Return the gains of a controller."""
+    if isinstance(wanted, IntegralFeedbackConfig):
+        return Gains(0.0, 2.0 * math.pi * wanted.bandwidth_hz)
+    if wanted.bandwidth_hz is None:
+        return Gains(wanted.kp or 0.0, wanted.ki_per_s or 0.0)
+    return gains_for(min(wanted.bandwidth_hz, 0.5 * rate_hz), rate_hz)
 
 
-def _gain_problems(
-    loaded: LoadedExperiment, wanted: PiFeedbackConfig, delay_s: float
-) -> Iterator[ConfigProblem]:
-    """Check phase and gain margin for a delay."""
-    rate_hz = loaded.config.sample_rate_hz
-    if wanted.bandwidth_hz is not None:
-        highest_hz = highest_bandwidth_hz(rate_hz, delay_s)
-        if wanted.bandwidth_hz > highest_hz:
-            rule = (
-                f"must be <= {highest_hz:.4g} Hz at {rate_hz:g} Hz and a delay of {delay_s:.3g} s"
-            )
-            hint = _needs(rate_needed_hz(wanted.bandwidth_hz, delay_s))
-            yield loaded.problem("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)
-        return
-    gains = _gains(wanted, rate_hz)
-    if _stable(gains, rate_hz, delay_s):
-        return
-    gain_margin, phase_margin = margins(gains, rate_hz, delay_s)
-    rule = (
-        f"must leave a gain margin of {LEAST_GAIN_MARGIN:g} and a phase margin of "
-        f"{LEAST_PHASE_MARGIN_DEG:g} degrees at {rate_hz:g} Hz and a delay of {delay_s:.3g} s"
-    )
-    value = f"kp {gains.kp:g}, ki_per_s {gains.ki_per_s:g}: {gain_margin:.3g}, {phase_margin:.3g}"
-    hint = _needs(_rate_for(gains, rate_hz, delay_s))
-    yield loaded.problem("feedback", rule, value, hint)
+def exchange_of(loaded: LoadedExperiment) -> Exchange:
+    """Return the timing of the loop."""
+    config = loaded.config
+    return Exchange(config.sample_rate_hz, config.block, loaded.device.info.latency_blocks)
 
 
-def _stable(gains: Gains, rate_hz: float, delay_s: float) -> bool:
-    gain_margin, phase_margin = margins(gains, rate_hz, delay_s)
-    return gain_margin >= LEAST_GAIN_MARGIN and phase_margin >= LEAST_PHASE_MARGIN_DEG
-
-
-def _rate_for(gains: Gains, rate_hz: float, delay_s: float) -> float:
-    """Return a rate, within 5 %, with sufficient margins; infinite if there is none."""
-    while rate_hz < _HIGHEST_RATE_HZ:
-        rate_hz *= 1.05
-        if _stable(gains, rate_hz, delay_s):
-            return rate_hz
-    return math.inf
-
-
-def _needs(rate_hz: float) -> str:
-    if rate_hz <= _HIGHEST_RATE_HZ:
-        return f"this needs at least {rate_hz:.4g} samples per second"
-    return "no sample rate is enough for this"
-
-
-def _resonance_problems(
-    loaded: LoadedExperiment, wanted: PiFeedbackConfig
-) -> Iterator[ConfigProblem]:
-    """Limit the gain at the resonance, which amplifies it by 1 / (2 damping), to one half."""
-    natural_hz, damping = _resonance(loaded, wanted)
-    if natural_hz is None or damping is None:
-        rule = "needs resonance_hz and damping_ratio of the actuator with its load"
-        yield loaded.problem("feedback", rule, hint="feedback excites it; the model has none")
-        return
-    rate_hz = loaded.config.sample_rate_hz
-    gains = _gains(wanted, rate_hz)
-    turn = 1.0 - cmath.exp(-2j * math.pi * min(natural_hz / rate_hz, 0.5))
-    size = abs(gains.kp + gains.ki_per_s / rate_hz / turn) / (2.0 * damping)
-    if size * LEAST_GAIN_MARGIN > 1.0:
-        rule = f"must have a gain of at most {1.0 / LEAST_GAIN_MARGIN:g} at the resonance"
-        where = f"{natural_hz:g} Hz, damping {damping:g}"
-        hint = f"at most bandwidth_hz {damping * natural_hz:.3g}, or ki_per_s of 2 pi times that"
-        yield loaded.problem("feedback", rule, f"{size:.3g} at {where}", hint)
-
-
-def _resonance(
-    loaded: LoadedExperiment, wanted: PiFeedbackConfig | IntegralFeedbackConfig
-) -> tuple[float | None, float | None]:
-    """Return natural frequency in Hz and damping: of the experiment or the model."""
+def _resonance(loaded: LoadedExperiment, wanted: AnyFeedbackConfig) -> FirstMode | None:
+    """Return the resonance of the experiment or the model; None if it is unknown."""
     structure = getattr(loaded.model, "structure", None)
     natural_hz = wanted.resonance_hz or getattr(structure, "natural_hz", None)
-    return natural_hz, wanted.damping_ratio or getattr(structure, "damping_ratio", None)
+    damping = wanted.damping_ratio or getattr(structure, "damping_ratio", None)
+    if natural_hz is None or damping is None:
+        return None
+    return FirstMode(natural_hz=natural_hz, damping_ratio=damping)
 
 
 def gains_for(bandwidth_hz: float, rate_hz: float) -> Gains:
@@ -204,44 +198,21 @@ def gains_for(bandwidth_hz: float, rate_hz: float) -> Gains:
     return Gains(0.0, 2.0 * rate_hz * math.sin(math.pi * bandwidth_hz / rate_hz))
 
 
-def highest_bandwidth_hz(rate_hz: float, extra_delay_s: float = 0.0) -> float:
-    """Return the largest bandwidth with the required phase margin.
-
-    The integral lags by 90 degrees minus half a sample, the loop by two samples. The margin of 60
-    degrees leaves 30 degrees for these 1.5 samples and the extra delay of link and sensor.
-    """
-    share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
-    return share / ((LOOP_DELAY - 0.5) / rate_hz + extra_delay_s)
+def bandwidth_of(kind: str, ki_per_s: float, rate_hz: float) -> float:
+    """Return the bandwidth of an integral gain, see :func:`feedback_gains`."""
+    if kind == "integral":
+        return ki_per_s / (2.0 * math.pi)
+    return rate_hz / math.pi * math.asin(min(0.5 * ki_per_s / rate_hz, 1.0))
 
 
-def rate_needed_hz(bandwidth_hz: float, extra_delay_s: float = 0.0) -> float:
-    """Return the sample rate for a bandwidth; infinite if the extra delay is too long."""
-    share = (90.0 - LEAST_PHASE_MARGIN_DEG) / 360.0
-    left_s = share / bandwidth_hz - extra_delay_s
-    return (LOOP_DELAY - 0.5) / left_s if left_s > 0.0 else math.inf
+def rounded_down(value: float) -> float:
+    """Return a value > 0 rounded down to three digits."""
+    unit = 10.0 ** (math.floor(math.log10(value)) - 2)
+    return math.floor(value / unit) * unit
 
 
-def margins(gains: Gains, rate_hz: float, extra_delay_s: float = 0.0) -> tuple[float, float]:
-    """Return gain margin and phase margin, in degrees, on an actuator of gain 1.
-
-    The gain margin is 1 over the largest open-loop gain with a lag of more than 180 degrees. The
-    phase margin is 0 if the loop gain never falls below 1.
-    """
-    angle = np.geomspace(1e-6, math.pi, _FREQUENCIES)
-    controller = gains.kp + gains.ki_per_s / rate_hz / (1.0 - np.exp(-1j * angle))
-    size = np.abs(controller)
-    late = angle * (LOOP_DELAY + extra_delay_s * rate_hz) - np.angle(controller)
-    beyond = size[late >= math.pi]
-    gain_margin = float(1.0 / beyond.max()) if beyond.size else math.inf
-    above = np.flatnonzero(size >= 1.0)
-    if not above.size:
-        return gain_margin, 180.0
-    if above[-1] == angle.size - 1:
-        return gain_margin, 0.0
-    return gain_margin, math.degrees(math.pi - float(late[: above[-1] + 1].max()))
-
-
-_OFFSET_SHARE = 0.1  # of the stroke limits, by default
+OFFSET_SHARE = 0.1
+"""Default largest offset, of the stroke limits."""
 _SLOWER = 5.0
 """Least time constant in loop delays per parameter (all may adapt to the same samples), which keeps
 the phase margin above 60 degrees."""
@@ -258,7 +229,7 @@ def adaptation_bounds(config: Experiment) -> AdaptationBounds:
     if config.feedback is not None:
         offset_um = 0.0
     elif offset_um is None:
-        offset_um = _OFFSET_SHARE * (high_um - low_um)
+        offset_um = OFFSET_SHARE * (high_um - low_um)
     shape = 0.0 if compensator.correction else 1.0
     return AdaptationBounds(offset_um, shape * wanted.gain, shape * wanted.weight)
 

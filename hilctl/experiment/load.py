@@ -15,12 +15,13 @@ from hilctl.base.yaml import Document, dump, load_document
 from hilctl.experiment.correction import Correction, load_correction
 from hilctl.experiment.devices import made_device
 from hilctl.experiment.file import Experiment
+from hilctl.experiment.open_loop import MeasuredResponse, load_response
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import load_model
 
 T = TypeVar("T")
 FILE_KEYS = {"compensator.model", "compensator.correction", "compensator.initial_state",
-             "waveform.path", "device.profile", "device.reader.profile",
+             "feedback.response", "waveform.path", "device.profile", "device.reader.profile",
              "device.calibration"}  # fmt: skip
 """Keys of an experiment that name files, relative to its own folder."""
 
@@ -36,6 +37,7 @@ class LoadedExperiment:
         yaml_text: The experiment including command-line settings.
         document: The file, with the line of each value.
         correction: Learned correction of the reference, or None.
+        response: Measured response for the margins of the feedback, or None.
         files: Contents of the files it refers to.
     """
 
@@ -46,6 +48,7 @@ class LoadedExperiment:
     yaml_text: str
     document: Document
     correction: Correction | None = None
+    response: MeasuredResponse | None = None
     files: TextFiles = field(default_factory=TextFiles)
 
     def problem(self, key: str, rule: str, value: str = "", hint: str = "") -> ConfigProblem:
@@ -107,9 +110,10 @@ def resolve(
     problems: list[ConfigProblem] = []
 
     def named(key: str, load: Callable[[Path, TextFiles], T]) -> T | None:
-        """Return the content of the file under a key of ``compensator``; None without the key."""
-        compensator = document.data.get("compensator")
-        name = compensator.get(key) if isinstance(compensator, dict) else None
+        """Return the content of the file under a dotted key; None without the key."""
+        section, name_key = key.split(".")
+        keys = document.data.get(section)
+        name = keys.get(name_key) if isinstance(keys, dict) else None
         if not isinstance(name, str):
             return None
         try:
@@ -117,19 +121,22 @@ def resolve(
         except ConfigError:
             raise
         except InputError as error:
-            where = document.where(("compensator", key))
-            raise ConfigError([ConfigProblem(where, f"compensator.{key}", str(error))]) from None
+            where = document.where((section, name_key))
+            raise ConfigError([ConfigProblem(where, key, str(error))]) from None
 
     config = _collect(problems, lambda: document.validate(Experiment))
     device = _collect(problems, lambda: made_device(document, folder, files))
-    model = _collect(problems, lambda: named("model", load_model))
-    correction = _collect(problems, lambda: named("correction", load_correction))
+    model = _collect(problems, lambda: named("compensator.model", load_model))
+    correction = _collect(problems, lambda: named("compensator.correction", load_correction))
+    response = _collect(problems, lambda: named("feedback.response", load_response))
     if config is not None:
         problems += _joint_problems(config, document)
     if problems or config is None or device is None:
         raise ConfigError(problems)
     yaml_text = dump(document.data)
-    return LoadedExperiment(config, device, model, folder, yaml_text, document, correction, files)
+    return LoadedExperiment(
+        config, device, model, folder, yaml_text, document, correction, response, files
+    )
 
 
 def _joint_problems(config: Experiment, document: Document) -> list[ConfigProblem]:

@@ -150,6 +150,11 @@ class _AnyFeedback(StrictModel):
     damping_ratio: float | None = Field(
         default=None, gt=0.0, le=2.0, description="damping ratio at resonance_hz"
     )
+    response: str | None = Field(
+        default=None,
+        description="file of hilctl tune with the measured response, from which the margins are"
+        " computed, instead of resonance_hz and damping_ratio",
+    )
 
 
 class PiFeedbackConfig(_AnyFeedback):
@@ -212,8 +217,9 @@ def _pi_where_not_said(value: Any) -> Any:
     return {"kind": "pi", **value} if isinstance(value, dict) else value
 
 
+AnyFeedbackConfig: TypeAlias = PiFeedbackConfig | IntegralFeedbackConfig
 FeedbackConfig: TypeAlias = Annotated[
-    Annotated[PiFeedbackConfig | IntegralFeedbackConfig, Field(discriminator="kind")],
+    Annotated[AnyFeedbackConfig, Field(discriminator="kind")],
     BeforeValidator(_pi_where_not_said),
 ]
 

@@ -76,6 +76,7 @@ def run_facts(
         "buffered": str(info.buffered).lower(),
         "fifo_depth": str(info.fifo_depth),
         "block": str(config.block),
+        "latency_blocks": str(info.latency_blocks),
         "waveform_samples": str(checked.forecast.samples),
         "compensator": getattr(loaded.model, "kind", "none"),
         "initial_state": checked.begun.begins,

@@ -1,10 +1,12 @@
 """Feedback around the compensator on the simulated rig, sample by sample through real runs."""
 
+import json
 from pathlib import Path
 
 import numpy as np
 import pytest
 
+from hilctl import api
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.base.samples import Flag
@@ -73,6 +75,27 @@ def test_an_integrator_takes_out_the_offset_of_small_loops(run_blocks):
     assert before.peak_error_percent > 20.0
     assert after.peak_error_percent < 1.5
     assert replay(recording).identical
+
+
+SMALL = (
+    "waveform={kind: multisine, unit: um, amplitude: 0.7, first_hz: 5.0, last_hz: 2200.0,"
+    " step_hz: 20.0, duration_s: 3.0, soft_start_s: 0.2, soft_end_s: 0.2}"
+)
+
+
+@pytest.mark.slow
+def test_a_tuned_loop_has_its_margins_in_operation(run, tmp_path):
+    """The proposal is accepted, and a run with it shows the same margins and little error."""
+    _, plain = run(STAGED, SMALL)
+    design = api.tune(plain.path, tmp_path / "response.yaml", tmp_path / "tune.html")
+    assert design.recorded is None
+    feedback = f"feedback={json.dumps(design.feedback)}"
+    _, small = run(STAGED, SMALL, DRIFT, feedback)
+    found = api.tune(small.path).recorded
+    assert found.gain_margin_db > 6.0
+    assert found.phase_margin_deg == pytest.approx(design.proposed.phase_margin_deg, abs=3.0)
+    _, recording = run(STAGED, DRIFT, "waveform.frequency_hz=20.0", feedback)
+    assert rms_error_percent(recording) < 0.3
 
 
 def test_the_input_is_recorded_with_its_correction(run):

@@ -1,1 +1,1 @@
-"""Frequency and step responses: measurement and fit, Bode plot and page."""
+"""Frequency and step responses: measurement and fit, feedback design, plots and pages."""

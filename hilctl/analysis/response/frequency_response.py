@@ -29,7 +29,9 @@ from hilctl.ilc.cycle import coefficients
 from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.recording.recording import Recording
 
-Signals: TypeAlias = Literal["command-displacement", "reference-displacement", "command-measured"]
+Signals: TypeAlias = Literal[
+    "command-displacement", "reference-displacement", "input-displacement", "command-measured"
+]
 Method: TypeAlias = Literal["periods", "averaged spectra", "sines"]
 SIGNALS: tuple[Signals, ...] = get_args(Signals)
 
@@ -190,7 +192,7 @@ def _polynomial(natural_hz: float, damping_ratio: float) -> F64:
     return np.array([omega**-2, 2.0 * damping_ratio / omega, 1.0])
 
 
-class _Lines(NamedTuple):
+class Lines(NamedTuple):
     """Response at the excited frequencies."""
 
     frequency_hz: F64
@@ -219,6 +221,40 @@ def frequency_response(recording: Recording, signals: Signals | None = None) -> 
     """
     default = SIGNALS[1] if recording.compensated else SIGNALS[0]
     signals = signals or default
+    measured = measured_lines(recording, signals)
+    lines = measured.lines
+    hz, response, noise = lines.frequency_hz, lines.response, lines.noise
+    sent, answered = signals.split("-")
+    units = {"command": recording.command_unit, "measured": recording.command_unit}
+    return FrequencyResponse(
+        path=recording.path,
+        signals=signals,
+        unit=f"{units.get(answered, 'um')}/{units.get(sent, 'um')}",
+        excitation=measured.excitation,
+        method=measured.method,
+        averages=lines.averages,
+        amplitude=lines.amplitude,
+        excited_lines=measured.excited_lines,
+        frequency_hz=hz,
+        response=response,
+        noise=noise,
+        coherence=lines.coherence,
+        free=lines.free,
+        **_fit(hz, response, noise, recording.sample_rate_hz, held=sent == "command"),
+    )
+
+
+class MeasuredLines(NamedTuple):
+    """Lines above the noise, with the excitation in words and its number of frequencies."""
+
+    lines: Lines
+    method: Method
+    excitation: str
+    excited_lines: int
+
+
+def measured_lines(recording: Recording, signals: Signals) -> MeasuredLines:
+    """Return the lines of a response without a fit, see :func:`frequency_response`."""
     columns = _columns(recording, signals)
     segments, method = _excitation(recording)
     if method == "sines":
@@ -232,32 +268,21 @@ def frequency_response(recording: Recording, signals: Signals | None = None) -> 
             f"{recording.path}: only {np.count_nonzero(usable)} of {excited} frequencies are above"
             f" the noise, fewer than {_FEWEST_LINES}: increase the amplitude or the duration"
         )
-    hz, response, noise = lines.frequency_hz[usable], lines.response[usable], lines.noise[usable]
-    units = {"command": recording.command_unit, "measured": recording.command_unit}
-    excitation = segments[0].label
+    lines = lines._replace(
+        frequency_hz=lines.frequency_hz[usable],
+        response=lines.response[usable],
+        noise=lines.noise[usable],
+        coherence=lines.coherence[usable],
+    )
+    hz, excitation = lines.frequency_hz, segments[0].label
     if method == "sines":
         excitation = f"{len(segments)} sines {hz[0]:g}-{hz[-1]:g} Hz"
-    return FrequencyResponse(
-        path=recording.path,
-        signals=signals,
-        unit="/".join(units.get(each, "um") for each in reversed(columns)),
-        excitation=excitation,
-        method=method,
-        averages=lines.averages,
-        amplitude=lines.amplitude,
-        excited_lines=excited,
-        frequency_hz=hz,
-        response=response,
-        noise=noise,
-        coherence=lines.coherence[usable],
-        free=lines.free,
-        **_fit(hz, response, noise, recording.sample_rate_hz, held=columns.sent == "command"),
-    )
+    return MeasuredLines(lines, method, excitation, excited)
 
 
 def _columns(recording: Recording, signals: Signals) -> _Columns:
-    names = {"displacement": "displacement_um", "reference": "reference_um"}
-    columns = _Columns(*(names.get(each, each) for each in signals.split("-")))
+    units = {"displacement": "_um", "reference": "_um", "input": "_um"}
+    columns = _Columns(*(f"{each}{units.get(each, '')}" for each in signals.split("-")))
     for name in columns:
         if not np.isfinite(recording.samples.column(name)).any():
             raise InputError(f"{recording.path}: {name} is not recorded: use other --signals")
@@ -286,7 +311,7 @@ def _excitation(recording: Recording) -> tuple[list[Segment], Method]:
 
 def _broad(
     recording: Recording, segment: Segment, columns: _Columns, method: Method
-) -> tuple[_Lines, Method]:
+) -> tuple[Lines, Method]:
     """Return the lines of one segment, from whole periods if it has them."""
     samples = steady_part(recording, segment).samples
     if not samples.index.size:
@@ -305,7 +330,7 @@ def _broad(
     return _averaged(sent, answered, size, recording.sample_rate_hz), method
 
 
-def _periods(sent: F64, answered: F64, periods: int, rate_hz: float) -> _Lines:
+def _periods(sent: F64, answered: F64, periods: int, rate_hz: float) -> Lines:
     """Return the lines of a multisine from whole periods, with their scatter."""
     period = sent.size // periods
     shape = periods, period
@@ -320,7 +345,7 @@ def _periods(sent: F64, answered: F64, periods: int, rate_hz: float) -> _Lines:
     response, noise, coherence = _scattered(x[:, excited], y[:, excited])
     spectra = y.mean(axis=0), np.sum(np.abs(y - y.mean(axis=0)) ** 2, axis=0)
     variance = spectra[1] / (periods * (periods - 1))
-    return _Lines(
+    return Lines(
         excited * rate_hz / period,
         response,
         noise,
@@ -360,7 +385,7 @@ def _free_lines(excited: I64, power: F64, variance: F64) -> FreeLines | None:
     return FreeLines(percent(power[even]), percent(power[odd]), percent(variance[free]))
 
 
-def _averaged(sent: F64, answered: F64, size: int, rate_hz: float) -> _Lines:
+def _averaged(sent: F64, answered: F64, size: int, rate_hz: float) -> Lines:
     """Return the response from averaged cross-spectra (Welch, H1) of segments of a size."""
     if size < 2 * _FEWEST_LINES:
         raise DataError(f"only {sent.size} samples: record a longer run")
@@ -375,10 +400,10 @@ def _averaged(sent: F64, answered: F64, size: int, rate_hz: float) -> _Lines:
     relative = np.sqrt((1.0 - coherence) / (2.0 * coherence * averages / _OVERLAP))
     response = cross / own
     noise = relative * np.abs(response)
-    return _Lines(hz, response, noise, coherence, 0.5 * float(np.ptp(sent)), averages)
+    return Lines(hz, response, noise, coherence, 0.5 * float(np.ptp(sent)), averages)
 
 
-def _sines(recording: Recording, segments: list[Segment], columns: _Columns) -> _Lines:
+def _sines(recording: Recording, segments: list[Segment], columns: _Columns) -> Lines:
     """Return one line per sine, from its steady cycles."""
     found = []
     for segment in segments:
@@ -392,7 +417,7 @@ def _sines(recording: Recording, segments: list[Segment], columns: _Columns) -> 
         rule = f"only {len(found)} sines have {_FEWEST_PERIODS} steady cycles"
         raise DataError(f"{recording.path}: {rule}, fewer than {_FEWEST_LINES}: make them longer")
     response, noise, coherence = (np.concatenate([line[k] for *_, line in found]) for k in range(3))
-    return _Lines(
+    return Lines(
         np.array([recording.sample_rate_hz / segment.period for segment, *_ in found]),
         response,
         noise,

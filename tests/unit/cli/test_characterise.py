@@ -178,6 +178,6 @@ def test_frequency_responses_are_tables_or_json(monkeypatch, tmp_path, hilctl, j
     assert json_of("frf", "a.mcap")[1]["responses"][0]["natural_hz"] == SMALL.natural_hz
 
 
-@pytest.mark.parametrize("command", ["frf", "step"])
+@pytest.mark.parametrize("command", ["frf", "step", "tune"])
 def test_a_run_without_a_response_is_refused(hilctl, command):
     assert hilctl(command, RUN)[0] == 2
