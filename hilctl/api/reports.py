@@ -148,7 +148,8 @@ def tune(
         if each is not None:
             check_writable(Path(each), overwrite=overwrite)
     recorded = run if isinstance(run, RecordedRun) else read(run)
-    design = design_feedback(recorded.recording, None if output is None else str(output))
+    named = None if output is None else str(Path(output).resolve())
+    design = design_feedback(recorded.recording, named)
     if output is not None:
         write_response(Path(output), design.response, overwrite=overwrite)
     if html is not None:

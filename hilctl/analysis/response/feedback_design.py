@@ -193,14 +193,14 @@ def open_loop_sheet(design: FeedbackDesign) -> FigureSpec:
     late_hz = float(hz[np.argmax(design.loop.lag >= np.pi)])
 
     def draw(axes: Axes, part: str) -> None:
-        values, line, at_hz = (
-            (size_db, 0.0, late_hz) if part == "magnitude, dB" else (-lag_deg, -180.0, crossing_hz)
-        )
+        values, line, at_hz = (size_db, 0.0, late_hz)
+        if part == "phase, °":
+            values, line, at_hz = (-lag_deg, -180.0, crossing_hz)
+            axes.set(ylim=(-315.0, -45.0), yticks=(-270.0, -180.0, -90.0))
         axes.plot(hz[shown], values[shown], color=DISPLACEMENT)
         axes.axhline(line, color=REFERENCE, linewidth=0.7)
         reached = float(np.interp(at_hz, hz, values))
-        label = "gain margin" if at_hz == late_hz else "phase margin"
-        axes.plot([at_hz, at_hz], [line, reached], color=MARK, marker="_", label=label)
+        axes.plot([at_hz, at_hz], [line, reached], color=MARK, marker="_", label="margin")
         axes.set(xscale="log", xlabel="frequency, Hz", ylabel=part)
         plain_numbers(axes)
 
