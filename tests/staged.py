@@ -6,9 +6,9 @@ import numpy as np
 
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.fit_api import FitRequest
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.settings import FitSettings
-from hilctl.identify.staged.fit_data import StagedFitData
 from hilctl.identify.staged.objective import Layers, Point
 from hilctl.identify.staged.staged_fits import convex_start
 from hilctl.models.integrated import exponential_integrated
@@ -33,7 +33,7 @@ def fit(data: list[SteadyLoop], **choices: Any) -> FittedModel:
     return fit_model(FitRequest(data, settings))
 
 
-def start(data: StagedFitData, layers: Layers, before: list[float], delay_s: float) -> Point:
+def start(data: FitData, layers: Layers, before: list[float], delay_s: float) -> Point:
     """Return the start of the search, the solution of the linear problem."""
     scale = np.ones(data.target_um.size)
-    return convex_start(data, layers, np.array(before), delay_s, scale).point
+    return convex_start(data, layers, np.array(before), delay_s, scale)[1]

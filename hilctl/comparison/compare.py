@@ -20,7 +20,8 @@ from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
 from hilctl.identify.data.cycles import loops_from_recording
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import FitData, FitRequest, OnProgress
+from hilctl.identify.fit_api import FitRequest, OnProgress
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.registry import entry
 from hilctl.identify.settings import FitKind, FitSettings

@@ -1,7 +1,7 @@
 """Models from measured data.
 
 ``pipeline`` turns records into an evaluated model. ``registry`` lists all kinds of model,
-``settings`` their settings, ``fit_api`` the types of a fit.
+``settings`` their settings, ``fit_api`` the types of a fit, ``fit_data`` its prepared records.
 
 data        loops and histories from recordings and tables
 searched    play models whose thresholds are searched from several starts
@@ -12,8 +12,8 @@ refine      better models from recordings of their use
 """
 
 PUBLIC = (
-    "data.cycles", "data.data_files", "data.records", "evaluation", "fit_api", "fit_model",
-    "model_page", "model_quality", "model_selection", "parallel", "pipeline",
+    "data.cycles", "data.data_files", "data.records", "evaluation", "fit_api", "fit_data",
+    "fit_model", "model_page", "model_quality", "model_selection", "parallel", "pipeline",
     "refine.acceptance", "refine.refinement", "registry", "settings", "summary",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -12,10 +12,8 @@ from scipy.interpolate import CubicSpline
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import History, Record, Records, SteadyLoop, turning_points
-from hilctl.identify.fit_api import PERIODS, FitData
+from hilctl.identify.fit_data import PERIODS, FitData
 from hilctl.identify.parallel import parallel_map
-from hilctl.identify.staged.fit_data import StagedFitData
-from hilctl.identify.staged.objective import response_um
 from hilctl.models.base import SMALLEST_STROKE, STROKES, HysteresisModel, stroke_class
 from hilctl.models.plays import PlayModel
 from hilctl.models.staged import StagedModel
@@ -208,19 +206,16 @@ def _modelled_um(model: HysteresisModel, data: FitData) -> F64:
     """Return the modelled displacement of all evaluated samples: float64[N]."""
     if isinstance(model, PlayModel):
         return data.response_um(model)
-    pairs = zip(data.records, data.speeds, strict=True)
-    return np.concatenate(parallel_map(lambda pair: _record_um(model, *pair), pairs))
+    return np.concatenate(parallel_map(lambda each: _record_um(model, each), data.records))
 
 
-def _record_um(model: HysteresisModel, record: Record, speed: F64) -> F64:
+def _record_um(model: HysteresisModel, record: Record) -> F64:
     """Return the modelled displacement of the evaluated samples of a record: float64[n]."""
     if not isinstance(record, SteadyLoop):
         command, _, ignored = record.run()
         return model.forward(record.sample_rate_hz).process(command)[ignored:]
     if record.sample_rate_hz > 0.0 and isinstance(model, StagedModel):
         return _sampled_cycle_um(model, record)
-    if isinstance(model, StagedModel):
-        return response_um(model, StagedFitData([record], [speed]))
     points, rate_hz = record.command.size, record.command.size * record.frequency_hz
     periods = np.tile(record.command, PERIODS)
     return model.forward(rate_hz).process(periods)[-points:]

@@ -28,7 +28,8 @@ from hilctl.identify.data.records import (
     turning_points,
 )
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import FitData, FitJob, FitRequest, FoundModel
+from hilctl.identify.fit_api import FitJob, FitRequest, FoundModel
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.resonances import without_modes
 from hilctl.models.base import IdentifiedRange, Provenance

@@ -15,7 +15,8 @@ from hilctl.base.errors import DataError
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History, Record, Records, SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge, judgement_of
-from hilctl.identify.fit_api import FitData, FitRequest, OnProgress, ignore_progress
+from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import creeps, fit_kind, fit_model
 from hilctl.identify.parallel import MapFunction, serial_map
 from hilctl.identify.settings import FitSettings, IdentifySettings
@@ -364,7 +365,7 @@ def choose_lag(
 ) -> int:
     """Return the lag with the least error; ``load`` returns data shifted by that many samples."""
     progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
-    lean = settings.model_copy(update={"starts": 1, "peak_goal_percent": None})
+    lean = settings.model_copy(update={"starts": 1})
     requests = [FitRequest(tuple(load(lag)), lean) for lag in range(MOST_LAG + 1)]
     return int(np.argmin(run(_rms_um, requests)))
 

@@ -13,7 +13,8 @@ from hilctl.base.yaml import Document
 from hilctl.identify.data.data_files import load_records
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import FitData, FitRequest, OnProgress, ignore_progress
+from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import FittedModel, error_table, fit_model
 from hilctl.identify.model_quality import Verdict, verdict_of
 from hilctl.identify.model_selection import (

@@ -9,7 +9,6 @@ from hilctl.identify.field.duhem_search import fit_generalised_duhem
 from hilctl.identify.field.field_search import fit_field
 from hilctl.identify.fit_api import FitJob, FoundModel
 from hilctl.identify.literature import (
-    fit_asymmetric,
     fit_bouc_wen,
     fit_duhem,
     fit_generalised,
@@ -55,7 +54,7 @@ CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
     ),
     "rdpi": CatalogueEntry("rate-dependent PI: no deadbands (5.11, 5.14)", _SEARCH, ANY, fit_plays),
     "asymmetric": CatalogueEntry(
-        "Omega with gamma = 0: no rate (1.14-1.16)", _WEIGHTS_FOLLOW, ANY, fit_asymmetric
+        "Omega with gamma = 0: no rate (1.14-1.16)", _SEARCH, ANY, fit_free
     ),
     "ppi": CatalogueEntry("PI: no rate, no deadbands (3.25-3.27)", _SEARCH, ANY, fit_plays),
     "spi": CatalogueEntry("PI, undone by stop operators (3.11-3.24)", _SEARCH, ANY, fit_plays),

@@ -22,7 +22,7 @@ Choices: TypeAlias = Mapping[str, Any]
 
 _PLAIN = ("ppi", "spi", "rdpi")
 _SEARCHED = (*_PLAIN, "integrated")
-_PLAYS = (*_SEARCHED, "staged")
+_PLAYS = (*_SEARCHED, "staged", "asymmetric")
 _TABLES = ("field", "generalised_duhem")
 _STAGES = ("staged", *_TABLES)
 
@@ -35,6 +35,7 @@ PUBLISHED: Mapping[str, Choices] = {
     "rdpi": {"plays": 4, "weights": "free", "weight_by": "hysteresis", "points": 400},
     # Nothing is published for staged models: these met the published figures on the simulated rig.
     "staged": {"plays": 20, "deadbands": 12, "offset": True, "starts": 4},
+    "asymmetric": {"offset": True},
     "preisach": {"lines": 16},
     "butterfly": {"plays": 16},
     "field": {"plays": 32, "cells": 12},
@@ -53,7 +54,7 @@ class FitSettings(StrictModel):
 
     kind: FitKind = Field("integrated", description="Kind of model.")
     plays: int = _of(
-        (*_PLAYS, "asymmetric", "generalised", "butterfly", "field"),
+        (*_PLAYS, "generalised", "butterfly", "field"),
         12,
         "Play operators n; auto selects the number by held-out loops.",
         ge=1,
@@ -93,7 +94,7 @@ class FitSettings(StrictModel):
         _SEARCHED, "exponential", "Weights a e^(-b i) (3.26, 6.19-6.23), or each weight by itself."
     )
     layout: Literal["even", "midpoint"] = _of(
-        _PLAYS, "even", "Thresholds alpha i (3.25, 6.18), or alpha (i - 1/2)."
+        _PLAIN, "even", "Thresholds alpha i (3.25, 6.18), or alpha (i - 1/2)."
     )
     weight_by: Literal["equal", "hysteresis"] = _of(
         _PLAYS, "equal", "Weight of a loop: 1 (6.24), or its peak hysteresis (5.14)."
@@ -117,12 +118,6 @@ class FitSettings(StrictModel):
     )
     magnets: bool = _of(("butterfly",), True, "Fit a bias field at zero command.")
     starts: int = _of(_PLAYS, 6, "Starting points of the search.", ge=1, le=1000)
-    peak_goal_percent: float | None = _of(
-        _PLAYS,
-        None,
-        "Reweight after the fit until no error is larger; percent of the stroke.",
-        gt=0.0,
-    )
     points: int = _of((), 300, "Points per loop.", ge=16, le=100_000)
 
     @model_validator(mode="before")

@@ -17,7 +17,8 @@ from scipy.optimize import least_squares
 
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import FitData, FitRequest
+from hilctl.identify.fit_api import FitRequest
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.settings import FitSettings
 from hilctl.kernels.hysteresis import deadband_block

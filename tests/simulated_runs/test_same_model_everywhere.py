@@ -28,12 +28,10 @@ TONES = [(a, f) for a in (3.0, 7.0) for f in (10.0, 100.0, 200.0)]
 FITS: dict[str, dict[str, Any]] = {
     **{kind: {"kind": kind} for kind in CATALOGUE if kind != "field"},
     "rdpi, exponential": {"kind": "rdpi", "weights": "exponential", "weight_by": "equal"},
-    "rdpi, peak": {"kind": "rdpi", "offset": True, "peak_goal_percent": 4.0},
     "integrated, free": {"kind": "integrated", "weights": "free"},
     "integrated, hysteresis": {"kind": "integrated", "weight_by": "hysteresis"},
     "staged, preisach": {"kind": "staged", "hysteresis": "preisach"},
     "staged, no lag": {"kind": "staged", "lag": "none"},
-    "staged, peak": {"kind": "staged", "peak_goal_percent": 0.4},
 }
 KERNELS = ("Nehalem", "Haswell", "Zen", "SkylakeX")
 NEEDS = {"Haswell": "avx2", "Zen": "avx2", "SkylakeX": "avx512f"}

@@ -50,11 +50,6 @@ class SteadyLoop:
         before = spline(time[:-1] - 1.0 / self.sample_rate_hz)
         return np.asarray((self.command - before) * self.sample_rate_hz, dtype=np.float64)
 
-    def run(self) -> tuple[F64, F64, int]:
-        """Return two periods to simulate, their rate, and the number of samples not evaluated."""
-        # One period from rest brings every play to its periodic state: it clips to a range.
-        return np.tile(self.command, 2), np.tile(self.rate(), 2), self.command.size
-
 
 @dataclass(frozen=True, slots=True)
 class History:

@@ -19,7 +19,8 @@ from hilctl.identify.data.data_faults import data_reasons
 from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judgement_of
-from hilctl.identify.fit_api import FitData, OnProgress, ignore_progress
+from hilctl.identify.fit_api import OnProgress, ignore_progress
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import VERSIONS, error_table, identified_range
 from hilctl.identify.model_selection import HeldOut, folds_of
 from hilctl.identify.refine.acceptance import (

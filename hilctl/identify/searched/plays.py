@@ -9,14 +9,8 @@ from scipy.linalg import qr
 
 from hilctl.base.types import F64
 from hilctl.identify.evaluation import weight_roots
-from hilctl.identify.fit_api import (
-    LEAST_SLOPE,
-    FitData,
-    FitJob,
-    FoundModel,
-    OnProgress,
-    StartOutcome,
-)
+from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel, OnProgress, StartOutcome
+from hilctl.identify.fit_data import GAMMA_S, SPACING, FitData
 from hilctl.identify.least_squares import bounded_and_free, converged, first_least
 from hilctl.identify.settings import FitSettings
 from hilctl.kernels.hysteresis import deadband_block
@@ -28,10 +22,6 @@ SEED = 1  # of the random starts
 DRAWS_A_START = 12  # random points tried per start
 EVALUATIONS = 60  # maximum per start
 POLISH = 300  # maximum for the best start
-ROUNDS = 30  # of reweighting
-ROUND = 15  # maximum evaluations per round of reweighting
-EMPHASIS = 0.3  # gain in weight per round of a sample beyond the goal
-NEARLY = 0.96  # of the goal, from which samples gain weight
 HELD = 1e-4  # of the space: distance to a bound that counts as at the bound
 
 
@@ -81,15 +71,6 @@ class SearchProblem(Protocol):
         """Return the parameters at a point under their published names."""
 
 
-@dataclass(frozen=True, slots=True)
-class SearchEnd:
-    """End of the search: the point, the scale of the errors, and all starts."""
-
-    x: F64
-    scale: F64
-    starts: tuple[StartOutcome, ...]
-
-
 def search(
     problem: SearchProblem,
     scale: F64,
@@ -97,8 +78,11 @@ def search(
     starts: int,
     rng: np.random.Generator,
     progress: OnProgress,
-) -> SearchEnd:
-    """Minimise the sum of squared, scaled errors from rough values and the best random points."""
+) -> tuple[F64, tuple[StartOutcome, ...]]:
+    """Minimise the sum of squared, scaled errors from rough values and the best random points.
+
+    Return the end of the best start, and all starts.
+    """
 
     def percent(x: F64) -> float:
         errors = problem.error_um(x, scale) * scale
@@ -118,7 +102,7 @@ def search(
     progress(starts / (starts + 1), "following the best start to its end")
     best = ends[first_least([outcome.rms_percent for outcome in outcomes])]
     best, _ = polished(problem, best, scale, POLISH)
-    return SearchEnd(best, scale, tuple(outcomes))
+    return best, tuple(outcomes)
 
 
 def polished(problem: SearchProblem, x: F64, scale: F64, evaluations: int) -> tuple[F64, int]:
@@ -134,44 +118,17 @@ def polished(problem: SearchProblem, x: F64, scale: F64, evaluations: int) -> tu
     return converged(residuals, x, space.low, space.high, evaluations, slopes)
 
 
-def refine_peak(
-    problem: SearchProblem, found: SearchEnd, goal_um: float, progress: OnProgress
-) -> SearchEnd:
-    """Return the point of least peak error; samples beyond a goal gain weight (Lawson)."""
-    best, x, scale = found, found.x, found.scale
-    samples = slice(scale.size - problem.held)
-    errors_um = np.abs(problem.error_um(x, scale)[samples])
-    peak = lowest = float(np.max(errors_um))
-    for i in range(ROUNDS):
-        if peak <= goal_um:
-            break
-        progress(i / ROUNDS, f"peak error {peak:.3g} µm, goal {goal_um:.3g} µm")
-        # The gain rises smoothly near the goal, so that rounding does not decide.
-        near = errors_um / goal_um
-        scale = scale.copy()
-        scale[samples] *= 1.0 + EMPHASIS * np.clip((near - NEARLY) / (1.0 - NEARLY), 0.0, 1.0)
-        x, _ = polished(problem, x, scale, ROUND)
-        errors_um = np.abs(problem.error_um(x, scale)[samples])
-        peak = float(np.max(errors_um))
-        if peak < lowest:
-            best, lowest = SearchEnd(x, scale, found.starts), peak
-    return best
-
-
 def searched_fit(problem: SearchProblem, job: FitJob) -> FoundModel:
     """Return the model that solves a problem."""
     data, settings = job.data, job.settings
     rng = np.random.default_rng(SEED)
     roots = weight_roots(data.records, settings.weight_by)
     scale = np.append(roots, np.ones(problem.held))
-    found = search(problem, scale, data.stroke_um, settings.starts, rng, job.progress)
-    if settings.peak_goal_percent is not None:
-        goal_um = settings.peak_goal_percent / 100.0 * data.stroke_um
-        found = refine_peak(problem, found, goal_um, job.progress)
-    known = problem.parameters(found.x, found.scale)
+    x, starts = search(problem, scale, data.stroke_um, settings.starts, rng, job.progress)
+    known = problem.parameters(x, scale)
     numbers = len(known.keys() - {"g_0"})  # which is 1 by definition
-    model, held = problem.build(found.x, found.scale), problem.space.at_bound(found.x)
-    return FoundModel(model, numbers, known, found.starts, at_bound=held)
+    at_bound = problem.space.at_bound(x)
+    return FoundModel(problem.build(x, scale), numbers, known, starts, at_bound=at_bound)
 
 
 SMOOTHNESS = 1e-4  # weight of a density's slope, see _held
@@ -244,11 +201,11 @@ class PlaysProblem:
         columns = self._columns(x)
         found, _ = self._solve(columns, scale)
         weights = found[1] * self._decay(x) if self._exponential else found[1:]
-        numbers = numbered(self._settings)
-        _, plays, by = self._data.plays(self._spacing(x), self._growth_s(x), numbers, weights)
-        parts = [by[:, :1] * spacing_limit(self._data, self._settings)]
+        before = np.array([0.0, 0.0, self._spacing(x), self._growth_s(x)])
+        _, plays, (_, by) = self._data.plays(before, numbered(self._settings), weights)
+        parts = [by[:, [SPACING]] * spacing_limit(self._data, self._settings)]
         if self._rate_dependent:
-            parts.append(by[:, 1:] * (self._data.reach / self._data.speed))
+            parts.append(by[:, [GAMMA_S]] * (self._data.reach / self._data.speed))
         if self._exponential:
             i = np.arange(1, weights.size + 1)
             parts.append((plays @ (-i * weights) / weights.size)[:, None])
@@ -386,14 +343,15 @@ class ExponentialProblem:
         """Return the derivatives of the error: float64[N, p]."""
         gain, weights = self._data.gain, self._play_weights(x)
         alpha, gamma_s = float(x[0]) * self._limit, float(x[1]) * self._slowest_s
-        v, plays, by = self._data.plays(alpha, gamma_s, self._numbers, weights)
+        before = np.array([0.0, 0.0, alpha, gamma_s])
+        v, plays, (_, by) = self._data.plays(before, self._numbers, weights)
         inner = float(x[2]) * gain * v + plays @ weights
         i = np.arange(1, weights.size + 1)
         fall = np.exp(-float(x[4]) / weights.size * i)
         above, rate_up = self._side_slopes(inner, x[5:8], -1.0)
         below, rate_down = self._side_slopes(-inner, x[8:11], 1.0)
         before = np.column_stack([
-            by * (self._limit, self._slowest_s),
+            by[:, [SPACING, GAMMA_S]] * (self._limit, self._slowest_s),
             gain * v,
             gain * (plays @ fall),
             plays @ (-i * weights) / weights.size,

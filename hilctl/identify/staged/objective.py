@@ -5,12 +5,11 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.types import F64, CommandUnit
+from hilctl.base.types import F64
 from hilctl.identify.fit_api import LEAST_SLOPE
-from hilctl.identify.staged.fit_data import LAG_S, PARAMETERS, Linear, StagedFitData
+from hilctl.identify.fit_data import LAG_S, PARAMETERS, FitData, Linear
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
 from hilctl.models.linear_stages import FirstMode
-from hilctl.models.plays import PlayModel
 from hilctl.models.staged import FieldLag, StagedModel
 
 STEEPEST = 5.0  # largest slope of the deadband function, relative to that around 0
@@ -53,17 +52,16 @@ class Layers:
     delay: bool = True
     half_period_s: float = 0.0  # half a sample period of the loop; 0.0 to ignore its delay
     offset: bool = True
-    midpoint: bool = False  # whether thresholds are alpha (i - 1/2) instead of alpha i
+    staged: bool = False  # whether the model has stages, at least a delay
 
     @property
     def numbers(self) -> F64:
         """Thresholds over their spacing: float64[n]."""
-        first = 0.5 if self.midpoint else 1.0
-        return np.arange(self.plays, dtype=np.float64) + first
+        return np.arange(1, self.plays + 1, dtype=np.float64)
 
     def spacing_limit(self, reach: float) -> float:
         """Return the largest spacing at which every play still moves in a full cycle."""
-        return reach / (self.plays + (0.0 if self.midpoint else 0.5))
+        return reach / (self.plays + 0.5)
 
     @property
     def dynamic(self) -> bool:
@@ -114,7 +112,7 @@ class Point:
         return np.concatenate((-d_n * np.arange(k, 0, -1), d_p * np.arange(1, k + 1)))
 
 
-def bounds(data: StagedFitData, layers: Layers, point: Point) -> tuple[F64, F64]:
+def bounds(data: FitData, layers: Layers, point: Point) -> tuple[F64, F64]:
     """Return lowest and highest values, float64[p]; equal for fixed parameters."""
     radian_s = RADIAN / data.top_hz
     limit, steepest = layers.spacing_limit(data.reach), 4.0 * data.gain
@@ -123,7 +121,7 @@ def bounds(data: StagedFitData, layers: Layers, point: Point) -> tuple[F64, F64]
         (1e-3 * radian_s, 3.0 * radian_s, layers.lag),
         (0.0, 20.0 / data.reach, layers.lag and layers.growth),
         (0.05 * limit, limit, True),
-        (0.0, data.reach / data.top_speed, layers.gamma),
+        (0.0, data.reach / data.speed, layers.gamma),
         (0.0, radian_s, layers.delay),
         (1e-3 * radian_s, 2.0 * radian_s, layers.structure),
         (1e-4 * radian_s**2, 4.0 * radian_s**2, layers.structure),
@@ -139,10 +137,16 @@ def bounds(data: StagedFitData, layers: Layers, point: Point) -> tuple[F64, F64]
     return low, high
 
 
-def error_and_slopes(data: StagedFitData, layers: Layers, point: Point) -> tuple[F64, F64]:
+def in_loop(layers: Layers, point: Point) -> Linear:
+    """Return structure and all delay of a point in a sampled loop."""
+    delay_s = loop_delay_s(layers.half_period_s, float(point.before[0]))
+    return replace(point.linear, delay_s=point.linear.delay_s + delay_s)
+
+
+def error_and_slopes(data: FitData, layers: Layers, point: Point) -> tuple[F64, F64]:
     """Return modelled minus measured displacement float64[N] and derivatives float64[N, p]."""
     lagged = data.lagged(float(point.before[0]), float(point.before[1]))
-    w, outputs, by = data.plays(lagged, point.before, layers.numbers, point.weights)
+    w, outputs, by = data.plays(point.before, layers.numbers, point.weights, lagged)
     inner = point.direct * w + outputs @ point.weights
     k, corners = point.up.size, point.corners_um
     parts = segments(inner, corners)
@@ -159,8 +163,7 @@ def error_and_slopes(data: StagedFitData, layers: Layers, point: Point) -> tuple
     inside[:, first + 1 + outputs.shape[1] : -2] = parts[:, outwards]
     inside[:, -2:] = _by_spacings(inner, point)
     lag_s = float(point.before[0])
-    late_s = point.linear.delay_s + loop_delay_s(layers.half_period_s, lag_s)
-    linear = replace(point.linear, delay_s=late_s)
+    linear = in_loop(layers, point)
     out = data.through(inside, linear)
     slopes = np.empty((w.size, out.shape[1] + 3))
     slopes[:, :PARAMETERS] = out[:, 1:first]
@@ -196,9 +199,7 @@ HIGHEST_DAMPING = 10.0  # of a FirstMode
 STAGE_PARAMETERS = ("tau_s", "growth_per_unit", "natural_hz", "damping_ratio", "delay_s")
 
 
-def integrated_model(
-    data: StagedFitData, layers: Layers, point: Point, unit: CommandUnit
-) -> IntegratedModel:
+def integrated_model(data: FitData, layers: Layers, point: Point) -> IntegratedModel:
     """Return Omega alone, without the stages."""
     steps = np.arange(1, point.up.size + 1)
     d_p, d_n = point.spacings_um
@@ -214,16 +215,11 @@ def integrated_model(
             down_thresholds=tuple((-d_n * steps).tolist()),
             down_weights=tuple(np.diff(point.down, prepend=1.0).tolist()),
         ),
-        output_offset_um=point.offset_um,
-        input_unit=unit,
-        input_range=data.input_range,
-        output_range_um=data.output_range_um,
+        **data.common(point.offset_um),
     )
 
 
-def staged_model(
-    data: StagedFitData, layers: Layers, point: Point, unit: CommandUnit
-) -> StagedModel:
+def staged_model(data: FitData, layers: Layers, point: Point) -> StagedModel:
     """Return Omega with the stages around it."""
     lag = None
     if layers.lag:
@@ -234,7 +230,7 @@ def staged_model(
         natural_hz, damping = structure_of(point.linear)
         structure = FirstMode(natural_hz=natural_hz, damping_ratio=damping)
     return StagedModel.around(
-        integrated_model(data, layers, point, unit),
+        integrated_model(data, layers, point),
         lag=lag,
         structure=structure,
         delay_s=point.linear.delay_s,
@@ -248,16 +244,18 @@ def structure_of(linear: Linear) -> tuple[float, float]:
     return 1.0 / (2.0 * math.pi * radian_s), linear.c_s / (2.0 * radian_s)
 
 
-def parameters(layers: Layers, point: Point, *, staged: bool) -> dict[str, float]:
+def parameters(layers: Layers, point: Point) -> dict[str, float]:
     """Return the parameters by name; weights are numbered as in (5.5) and (6.6)."""
     out: dict[str, float] = {}
     if layers.lag:
         out |= {"tau_s": float(point.before[0]), "growth_per_unit": float(point.before[1])}
     if layers.structure:
         out["natural_hz"], out["damping_ratio"] = structure_of(point.linear)
-    if staged:
+    if layers.staged:
         out["delay_s"] = point.linear.delay_s
-    out |= {"alpha": float(point.before[2]), "gamma": float(point.before[3])}
+    out["alpha"] = float(point.before[2])
+    if layers.gamma:
+        out["gamma"] = float(point.before[3])
     out |= {"a_0": point.direct, "g_0": 1.0}
     out |= dict(zip(("d_p", "d_n"), point.spacings_um, strict=True))
     out |= {f"a_{i}": float(a) for i, a in enumerate(point.weights, start=1)}
@@ -265,37 +263,3 @@ def parameters(layers: Layers, point: Point, *, staged: bool) -> dict[str, float
     out |= {f"g_{j}": float(g) for j, g in enumerate(up, start=1)}
     out |= {f"g_-{j}": float(g) for j, g in enumerate(down, start=1)}
     return out | ({"output_offset_um": point.offset_um} if layers.offset else {})
-
-
-def response_um(model: StagedModel, data: StagedFitData) -> F64:
-    """Return the modelled displacement of all evaluated samples: float64[N]."""
-    inner, lag = model.hysteresis, model.lag
-    lagged = data.lagged(lag.tau_s if lag else 0.0, lag.growth_per_unit if lag else 0.0)
-    if isinstance(inner, PlayModel):
-        x = _play_response_um(inner, lagged, data)
-    else:
-        x = data.respond(lagged[0], lambda: inner.forward(1.0))
-    out = data.through(x[:, None], stages_of(model, data.half_period_s))
-    return out[:, 0] + model.output_offset_um
-
-
-def stages_of(model: StagedModel, half_period_s: float) -> Linear:
-    """Return structure and all delay of a model in a sampled loop."""
-    lag_s, structure = model.lag.tau_s if model.lag else 0.0, model.structure
-    delay_s = model.delay_s + loop_delay_s(half_period_s, lag_s)
-    if structure is None:
-        return Linear(delay_s)
-    radian_s = 1.0 / (2.0 * math.pi * structure.natural_hz)
-    return Linear(delay_s, 2.0 * structure.damping_ratio * radian_s, radian_s**2)
-
-
-def _play_response_um(
-    model: PlayModel, lagged: tuple[list[F64], list[F64]], data: StagedFitData
-) -> F64:
-    before = np.array([0.0, 0.0, 1.0, model.threshold_growth_s])
-    weights = np.array(model.weights)
-    w, outputs, _ = data.plays(lagged, before, np.array(model.thresholds), weights)
-    x = model.direct * w + outputs @ weights
-    if isinstance(model, IntegratedModel):
-        x = model.deadband(x)
-    return np.asarray(x + model.output_offset_um)

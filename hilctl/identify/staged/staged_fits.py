@@ -16,7 +16,16 @@ import numpy as np
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64, I64
 from hilctl.identify.evaluation import weight_roots
-from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel, OnProgress, StartOutcome
+from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel, StartOutcome
+from hilctl.identify.fit_data import (
+    GAMMA_S,
+    GROWTH,
+    LAG_S,
+    SPACING,
+    WITHOUT_STAGES,
+    FitData,
+    Linear,
+)
 from hilctl.identify.least_squares import (
     ErrorAndSlopes,
     bounded_weights,
@@ -26,15 +35,6 @@ from hilctl.identify.least_squares import (
 )
 from hilctl.identify.literature import fit_triangle, triangle_thresholds
 from hilctl.identify.settings import FitSettings
-from hilctl.identify.staged.fit_data import (
-    GAMMA_S,
-    GROWTH,
-    LAG_S,
-    SPACING,
-    WITHOUT_STAGES,
-    Linear,
-    StagedFitData,
-)
 from hilctl.identify.staged.objective import (
     DYNAMIC,
     RADIAN,
@@ -44,33 +44,30 @@ from hilctl.identify.staged.objective import (
     Point,
     bounds,
     error_and_slopes,
+    in_loop,
     integrated_model,
     loop_delay_s,
     parameters,
     segments,
     staged_model,
-    stages_of,
 )
+from hilctl.models.implicit_models import PreisachModel
+from hilctl.models.integrated import IntegratedModel
 from hilctl.models.staged import StagedModel
 
 KNOTS = 16  # of Lambda^-1
 
 
-@dataclass(frozen=True, slots=True)
-class WeightedStart:
-    """A point, and the root mean square of Lambda^-1(y) - Pi(v) there in um."""
-
-    point: Point
-    rms_um: float
-
-
 def convex_start(
-    data: StagedFitData, layers: Layers, before: F64, delay_s: float, scale: F64
-) -> WeightedStart:
-    """Return a start with all weights for fixed lag, thresholds and total delay."""
+    data: FitData, layers: Layers, before: F64, delay_s: float, scale: F64
+) -> tuple[float, Point]:
+    """Return a start with all weights for fixed lag, thresholds and total delay.
+
+    It is preceded by the root mean square of Lambda^-1(y) - Pi(v) there, in um.
+    """
     blank = np.zeros(layers.plays)
     lagged = data.lagged(float(before[0]), float(before[1]))
-    w, outputs, _ = data.plays(lagged, before, layers.numbers, blank)
+    w, outputs, _ = data.plays(before, layers.numbers, blank, lagged)
     y = data.undelayed(delay_s) if delay_s else data.target_um
     knots = np.linspace(float(y.min()), float(y.max()), KNOTS + 1)
     middle = 0.5 * (knots[0] + knots[-1]) if layers.offset else 0.0
@@ -91,10 +88,10 @@ def convex_start(
     error = (left @ found + constant - target) * scale
     point = _point(data, layers, found[: layers.plays + 1], knots, x)
     point = _placed(data, layers, point, before, delay_s)
-    return WeightedStart(point, float(np.sqrt(np.mean(error**2))))
+    return float(np.sqrt(np.mean(error**2))), point
 
 
-def _point(data: StagedFitData, layers: Layers, weights: F64, knots: F64, x: F64) -> Point:
+def _point(data: FitData, layers: Layers, weights: F64, knots: F64, x: F64) -> Point:
     """Turn x = Lambda^-1 at its knots into Lambda, with even deadbands and slope 1 around 0."""
     k = layers.deadbands
     least = 1e-3 * data.stroke_um
@@ -116,9 +113,7 @@ def _point(data: StagedFitData, layers: Layers, weights: F64, knots: F64, x: F64
     )
 
 
-def _placed(
-    data: StagedFitData, layers: Layers, point: Point, before: F64, delay_s: float
-) -> Point:
+def _placed(data: FitData, layers: Layers, point: Point, before: F64, delay_s: float) -> Point:
     """Add the stages; the delay is split between a structure above the data and transport."""
     own_s = delay_s - loop_delay_s(layers.half_period_s, float(before[0]))
     linear = Linear(max(own_s, 0.0) if layers.delay else 0.0)
@@ -137,8 +132,6 @@ SPACINGS = (1.0, 0.6)  # of the largest possible spacing
 LAGS = (0.05, 0.12, 0.3, 0.8)  # of a radian at the highest frequency
 GAMMAS = (0.02, 0.06, 0.15, 0.4)  # of the growth at which thresholds reach the largest command
 DELAYS = (0.04, 0.15)  # of a radian
-PEAK_ROUNDS = 40
-PEAK_STEPS = 3
 
 
 @dataclass(frozen=True, slots=True)
@@ -158,7 +151,7 @@ class StagedEnd:
 class StagedTask:
     """One start and the data to fit."""
 
-    data: StagedFitData
+    data: FitData
     layers: Layers
     point: Point
     scale: F64
@@ -184,7 +177,7 @@ def descended(task: StagedTask) -> tuple[F64, float]:
     return x, float(errors @ errors)
 
 
-def find_staged(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
+def find_staged(job: FitJob, data: FitData, layers: Layers) -> StagedEnd:
     """Minimise the sum of squared, weighted errors over all parameters.
 
     Starts are a grid of the nonlinear parameters, with linear solutions for all weights. The best
@@ -196,10 +189,10 @@ def find_staged(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
     _check(data, layers)
     progress(0.0, "weights for a few lags")
     few, few_scale = data.thinned(scale, FEW_POINTS)
-    ranked = sorted(_grid(few, layers, few_scale), key=lambda start: start.rms_um)
+    ranked = sorted(_grid(few, layers, few_scale), key=lambda start: start[0])
     ranked = ranked[: settings.starts]
     progress(0.2, f"following {len(ranked)} starts")
-    tasks = [StagedTask(few, layers, start.point, few_scale, ROUNDS) for start in ranked]
+    tasks = [StagedTask(few, layers, point, few_scale, ROUNDS) for _, point in ranked]
     ends = job.run(descended, tasks)
     outcomes = [
         _outcome(i, task, end) for i, (task, end) in enumerate(zip(tasks, ends, strict=True))
@@ -210,9 +203,6 @@ def find_staged(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
     task = StagedTask(some, layers, tasks[best].point.unpack(ends[best][0]), some_scale, POLISH)
     task = StagedTask(data, layers, task.point.unpack(descended(task)[0]), scale, POLISH)
     x, _ = descended(task)
-    if settings.peak_goal_percent is not None:
-        goal_um = settings.peak_goal_percent / 100.0 * data.stroke_um
-        x, scale = lower_peak(task, x, goal_um, progress)
     point = task.point.unpack(x)
     low, high = bounds(data, layers, point)
     margin = 1e-6 * (high - low)
@@ -222,7 +212,7 @@ def find_staged(job: FitJob, data: StagedFitData, layers: Layers) -> StagedEnd:
     return StagedEnd(point, errors, slopes, free, held, scale, tuple(outcomes))
 
 
-def _check(data: StagedFitData, layers: Layers) -> None:
+def _check(data: FitData, layers: Layers) -> None:
     if layers.dynamic and not data.all_steady:
         raise DataError(
             f"lag, structure and delay need steady loops, but there is a history: {WITHOUT_STAGES}"
@@ -234,11 +224,11 @@ def _check(data: StagedFitData, layers: Layers) -> None:
         )
 
 
-def _grid(data: StagedFitData, layers: Layers, scale: F64) -> list[WeightedStart]:
+def _grid(data: FitData, layers: Layers, scale: F64) -> list[tuple[float, Point]]:
     radian_s = RADIAN / data.top_hz
     limit = layers.spacing_limit(data.reach)
     lags = [part * radian_s for part in LAGS] if layers.lag else [0.0]
-    fastest = data.reach / data.top_speed
+    fastest = data.reach / data.speed
     gammas = [part * fastest for part in GAMMAS] if layers.gamma else [0.0]
     late = layers.delay or layers.structure
     delays = [part * radian_s for part in (DELAYS if late else (0.0,))]
@@ -261,33 +251,12 @@ def _outcome(number: int, task: StagedTask, end: tuple[F64, float]) -> StartOutc
     )
 
 
-def lower_peak(task: StagedTask, x: F64, goal_um: float, progress: OnProgress) -> tuple[F64, F64]:
-    """Reduce the largest error to a goal by Lawson's reweighting; return point and scale."""
-    low, high = bounds(task.data, task.layers, task.point.unpack(x))
-    scale, plain = task.scale, np.ones_like(task.scale)
-    best = (x, scale)
-    errors, _ = task.evaluate(plain)(x)
-    peak = lowest = float(np.max(np.abs(errors)))
-    for i in range(PEAK_ROUNDS):
-        if peak <= goal_um:
-            break
-        progress(0.7 + 0.3 * i / PEAK_ROUNDS, f"peak error {peak:.3g} µm, goal {goal_um:.3g} µm")
-        scale = scale * np.sqrt(0.3 + np.abs(errors) / peak)
-        scale = scale / float(np.sqrt(np.mean(scale**2)))
-        x, _, _ = descend(task.evaluate(scale), x, low, high, PEAK_STEPS)
-        errors, _ = task.evaluate(plain)(x)
-        peak = float(np.max(np.abs(errors)))
-        if peak < lowest:
-            best, lowest = (x, scale), peak
-    return best
-
-
 DELAY, C_S, Q_S2 = range(SPACING + 2, DYNAMIC)
 RIDGE = 1e-9
 
 
 def standard_errors(
-    found: StagedEnd, layers: Layers, places: tuple[slice, ...], *, staged: bool
+    found: StagedEnd, layers: Layers, places: tuple[slice, ...]
 ) -> dict[str, float]:
     """Return standard errors of free parameters; none for fewer than two records.
 
@@ -299,7 +268,7 @@ def standard_errors(
         return {}
     covariance = _covariance(found, places)
     out: dict[str, float] = {}
-    by = _stages(found, layers, staged=staged) | _operators(layers, covariance.shape[0])
+    by = _stages(found, layers) | _operators(layers, covariance.shape[0])
     for name, slopes in by.items():
         if not found.free[list(slopes)].any():
             continue
@@ -309,20 +278,20 @@ def standard_errors(
     return out
 
 
-def at_bound(found: StagedEnd, layers: Layers, *, staged: bool) -> tuple[str, ...]:
+def at_bound(found: StagedEnd, layers: Layers) -> tuple[str, ...]:
     """Return the names of parameters at a bound; see :func:`standard_errors`."""
-    by = _stages(found, layers, staged=staged) | _operators(layers, found.held.size)
+    by = _stages(found, layers) | _operators(layers, found.held.size)
     return tuple(name for name, slopes in by.items() if found.held[next(iter(slopes))])
 
 
-def _stages(found: StagedEnd, layers: Layers, *, staged: bool) -> dict[str, dict[int, float]]:
+def _stages(found: StagedEnd, layers: Layers) -> dict[str, dict[int, float]]:
     """Return the derivatives of each reported parameter of the stages by fitted ones."""
     by: dict[str, dict[int, float]] = {}
     if layers.lag:
         by |= {"tau_s": {LAG_S: 1.0}, "growth_per_unit": {GROWTH: 1.0}}
     if layers.gamma:
         by["gamma"] = {GAMMA_S: 1.0}
-    if staged and layers.delay:
+    if layers.delay:
         by["delay_s"] = {DELAY: 1.0}
     if layers.structure:
         radian_s, c_s = math.sqrt(found.point.linear.q_s2), found.point.linear.c_s
@@ -366,38 +335,38 @@ SPARE = 0.1  # margin of the command span, of the range of the data
 SMOOTHNESS = 0.2  # weight of differences between neighbouring densities
 
 
-def with_triangle(data: StagedFitData, model: StagedModel, lines: int, scale: F64) -> StagedModel:
-    """Replace the hysteresis of a staged model by a fitted Preisach triangle."""
+def with_triangle(
+    data: FitData, layers: Layers, point: Point, lines: int, scale: F64
+) -> PreisachModel:
+    """Return a Preisach triangle in place of the plays and deadbands of a point."""
     low, high = data.input_range
     thresholds = triangle_thresholds(data, lines)
-    lag = model.lag
-    lagged = data.lagged(lag.tau_s if lag else 0.0, lag.growth_per_unit if lag else 0.0)
+    lagged = data.lagged(float(point.before[LAG_S]), float(point.before[GROWTH]))
     spacing = np.array([0.0, 0.0, 1.0, 0.0])
-    w, outputs, _ = data.plays(lagged, spacing, thresholds[1:], np.zeros(lines - 1))
+    w, outputs, _ = data.plays(spacing, thresholds[1:], np.zeros(lines - 1), lagged)
 
     def densities(columns: F64, least: F64, table: I64) -> tuple[F64, float]:
-        seen = data.through(columns, stages_of(model, data.half_period_s))
+        seen = data.through(columns, in_loop(layers, point))
         return smooth_densities(seen, data.target_um, scale, least, table, SMOOTHNESS)
 
     spare = SPARE * (high - low)
-    fields = {"command_span": (low - spare, high + spare), "input_unit": model.input_unit}
-    triangle, _ = fit_triangle(data, np.column_stack([w, outputs]), densities, fields)
-    return model.model_copy(update={"hysteresis": triangle})
+    fields = {"command_span": (low - spare, high + spare), "input_unit": data.unit}
+    return fit_triangle(data, np.column_stack([w, outputs]), densities, fields)[0]
 
 
 def fit_free(job: FitJob) -> FoundModel:
-    """Fit the integrated model with free weights."""
-    data = StagedFitData(job.data.records, job.data.speeds)
+    """Fit the integrated model with free weights, whose thresholds grow unless it is asymmetric."""
+    gamma = job.settings.kind == "integrated"
     layers = _layers(
-        job.settings, lag=False, growth=False, gamma=True, structure=False, delay=False
+        job.settings, lag=False, growth=False, gamma=gamma, structure=False, delay=False
     )
-    return _fitted(job, data, layers, staged=False)
+    found = find_staged(job, job.data, layers)
+    return _found(job.data, layers, found, integrated_model(job.data, layers, found.point))
 
 
 def fit_staged(job: FitJob) -> FoundModel:
     """Fit hysteresis, lag, structure and delay, then a Preisach triangle if requested."""
-    settings = job.settings
-    data = StagedFitData(job.data.records, job.data.speeds)
+    settings, data = job.settings, job.data
     layers = _layers(
         settings,
         lag=settings.lag != "none",
@@ -406,40 +375,36 @@ def fit_staged(job: FitJob) -> FoundModel:
         structure=settings.structure,
         delay=settings.delay,
         half_period_s=data.half_period_s,
+        staged=True,
     )
-    found = _fitted(job, data, layers, staged=True)
+    end = find_staged(job, data, layers)
+    model = staged_model(data, layers, end.point)
+    found = _found(data, layers, end, model)
     if settings.hysteresis == "integrated":
         return found
     job.progress(0.9, "densities of the Preisach triangle")
-    scale = weight_roots(job.data.records, settings.weight_by)
-    assert isinstance(found.model, StagedModel)
-    model = with_triangle(data, found.model, settings.lines, scale)
+    triangle = with_triangle(data, layers, end.point, settings.lines, end.scale)
     known = {name: found.parameters[name] for name in STAGE_PARAMETERS if name in found.parameters}
     errors = {name: error for name, error in found.standard_errors.items() if name in known}
     held = tuple(name for name in found.at_bound if name in known)
-    known["output_offset_um"] = model.hysteresis.output_offset_um
+    known["output_offset_um"] = triangle.output_offset_um
+    model = model.model_copy(update={"hysteresis": triangle})
     return FoundModel(model, len(known) + settings.lines**2, known, found.starts, errors, held)
 
 
 def _layers(settings: FitSettings, **stages: Any) -> Layers:
-    return Layers(
-        plays=settings.plays,
-        deadbands=settings.deadbands,
-        offset=settings.offset,
-        midpoint=settings.layout == "midpoint",
-        **stages,
-    )
+    return Layers(settings.plays, settings.deadbands, offset=settings.offset, **stages)
 
 
-def _fitted(job: FitJob, data: StagedFitData, layers: Layers, *, staged: bool) -> FoundModel:
-    found = find_staged(job, data, layers)
-    build = staged_model if staged else integrated_model
-    known = parameters(layers, found.point, staged=staged)
+def _found(
+    data: FitData, layers: Layers, end: StagedEnd, model: IntegratedModel | StagedModel
+) -> FoundModel:
+    known = parameters(layers, end.point)
     return FoundModel(
-        build(data, layers, found.point, job.data.unit),
+        model,
         len(known) - 1,
         known,
-        found.starts,
-        standard_errors(found, layers, data.places, staged=staged),
-        at_bound(found, layers, staged=staged),
+        end.starts,
+        standard_errors(end, layers, data.places),
+        at_bound(end, layers),
     )

@@ -13,7 +13,8 @@ from hilctl.base.types import F64
 from hilctl.identify.data.data_files import without_gaps
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import MotionError, largest_errors, motions_of, stroke_errors
-from hilctl.identify.fit_api import FitData, FitRequest
+from hilctl.identify.fit_api import FitRequest
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.model_quality import MOST_PERCENT, Verdict, grade_of
 from hilctl.identify.parallel import parallel_map, workers
 from hilctl.identify.pipeline import (

@@ -9,7 +9,7 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.identify.data.cycles import average_cycle
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.fit_api import FitData
+from hilctl.identify.fit_data import FitData
 from hilctl.models.base import HysteresisModel
 from hilctl.models.integrated import exponential_integrated
 from hilctl.models.plays import PlayModel

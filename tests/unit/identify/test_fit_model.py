@@ -12,7 +12,8 @@ from hilctl.base.errors import DataError
 from hilctl.base.types import CommandUnit
 from hilctl.identify.data.records import History, Records, SteadyLoop
 from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import LEAST_SLOPE, FitData, FitRequest
+from hilctl.identify.fit_api import LEAST_SLOPE, FitRequest
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import (
     FittedModel,
     creep_of,
@@ -173,15 +174,6 @@ def test_hysteresis_weights_shift_the_fit_to_wide_loops(loops_of):
     weighted = fit("rdpi", loops, weight_by="hysteresis")
     assert weighted.errors[2].rms_percent < even.errors[2].rms_percent
     assert weighted.errors[0].rms_percent > even.errors[0].rms_percent
-
-
-def test_peak_goal_lowers_the_peak(loops_of):
-    loops = loops_of(OMEGA, [(6.0, 10.0), (6.0, 150.0)])
-    plain = fit("rdpi", loops, weight_by="equal", offset=True)
-    goal = 0.9 * plain.peak_percent
-    refined = fit("rdpi", loops, weight_by="equal", offset=True, peak_goal_percent=goal)
-    assert refined.peak_percent <= goal
-    assert refined.rms_percent > plain.rms_percent
 
 
 def test_no_slope_falls_below_the_least(loops_of):

@@ -5,10 +5,9 @@ import pytest
 
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import FitData, FitJob
+from hilctl.identify.fit_api import FitJob
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.literature import (
-    _Asymmetric,
-    fit_asymmetric,
     fit_bouc_wen,
     fit_duhem,
     fit_generalised,
@@ -17,6 +16,7 @@ from hilctl.identify.literature import (
     fit_straight,
 )
 from hilctl.identify.settings import FitSettings
+from hilctl.identify.staged.staged_fits import fit_free
 from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.implicit_models import (
     BoucWenModel,
@@ -62,13 +62,14 @@ FITS = [
     (fit_bouc_wen, BOUC_WEN, 0.01),
     (fit_bouc_wen, BOUC_WEN_2, 0.01),
     (fit_duhem, DuhemModel(**COMMON, a=0.4, b=8.0, c=6.0), 0.01),
-    (fit_asymmetric, ASYMMETRIC, 1.0),
+    (fit_free, ASYMMETRIC, 1.0),
 ]
 
 
 def found_by(fit, data):
     """Return the model that a fit finds with the settings of its kind."""
-    return fit(FitJob(data, FitSettings(kind=fit.__name__.removeprefix("fit_")))).model
+    kind = "asymmetric" if fit is fit_free else fit.__name__.removeprefix("fit_")
+    return fit(FitJob(data, FitSettings(kind=kind))).model
 
 
 @pytest.mark.parametrize(("fit", "truth", "peak_percent"), FITS)
@@ -84,7 +85,7 @@ def test_a_model_of_its_own_kind_is_found_again(data_of, fit, truth, peak_percen
 
 
 @pytest.mark.parametrize("fit", [
-    *(fit_straight, fit_preisach, fit_kp, fit_bouc_wen, fit_duhem, fit_asymmetric),
+    *(fit_straight, fit_preisach, fit_kp, fit_bouc_wen, fit_duhem, fit_free),
     pytest.param(fit_generalised, marks=SLOW),
 ])  # fmt: skip
 def test_commands_may_all_lie_on_one_side(fit):
@@ -126,14 +127,3 @@ def test_histories_are_fitted_like_loops():
     command = (1.0 + time) * np.sin(2.0 * np.pi * 5.0 * time)
     data = FitData([History("growing", command, PREISACH.forward(1.0).process(command), 1000.0)])
     assert judge(found_by(fit_preisach, data), data).peak_percent <= 1.0
-
-
-def test_slopes_of_the_asymmetric_model_agree_with_differences(data_of):
-    model = PpiModel(direct=4.0, weights=(1.0, 2.0), thresholds=(0.5, 1.5))
-    settings = FitSettings(kind="asymmetric", plays=5, deadbands=3)
-    problem = _Asymmetric(FitJob(data_of(model), settings), 0.8)
-    x = problem.begin() + 0.05
-    slopes = problem.slopes_um(x)
-    for i, step in enumerate(1e-6 * np.eye(x.size)):
-        expected = (problem.error_um(x + step) - problem.error_um(x - step)) / 2e-6
-        np.testing.assert_allclose(slopes[:, i], expected, atol=1e-5, err_msg=str(i))

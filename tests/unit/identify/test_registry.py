@@ -80,11 +80,8 @@ def piezo_fit(history: History, **choices: Any) -> FittedModel:
 
 @needs_data
 def test_model_and_test_file_within_the_published_baseline(model_file, test_file):
-    """With the sensor's lag of 2 samples taken out, both files are met within the baselines.
-
-    The drift of the first seconds sets the peak on the model file; the goal of 2 % takes it down.
-    """
-    found = piezo_fit(model_file.without_lag(2), peak_goal_percent=2.0)
+    """Without the sensor's lag of 2 samples and its creep, both files meet the baselines."""
+    found = piezo_fit(model_file.without_lag(2), creep=True)
     assert found.peak_percent <= 2.0
     assert found.rms_percent <= 0.75
     tried = judge(found.model, [test_file.without_lag(2)])

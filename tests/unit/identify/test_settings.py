@@ -49,7 +49,6 @@ def test_staged_models_have_their_stages_unless_left_out():
     ({"kind": "staged", "weights": "exponential"}, "not of staged"),
     ({"kind": "staged", "creep": True}, "not of staged"),
     ({"kind": "staged", "hysteresis": "preisach", "lag": "none"}, "needs a lag"),
-    ({"kind": "ppi", "peak_goal_percent": -1.0}, "greater than 0"),
     ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "deadbands"),
     ({"kind": "kp", "plays": "auto"}, "not of kp"),
 ])  # fmt: skip
@@ -77,6 +76,6 @@ def test_rows_have_defaults_limits_and_kinds():
     assert rows["plays"][0].startswith("12, 10 for ppi")
     assert rows["plays"][1] == "1 to 200"
     assert rows["weights"][1] == "exponential, free"
-    assert rows["peak_goal_percent"][:2] == ["-", "> 0.0"]
+    assert rows["turning_um"][:2] == ["-", ""]
     assert rows["lag"][2] == "staged"
     assert "table.time_column" in rows

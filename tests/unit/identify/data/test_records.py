@@ -26,13 +26,6 @@ def test_rate_without_a_run_is_not_late():
     np.testing.assert_allclose(loop.rate(), expected, atol=1e-5 * 63)
 
 
-def test_run_of_a_loop_judges_the_second_period():
-    loop = SteadyLoop("x", np.sin(PHASE), np.cos(PHASE), 10.0)
-    command, rate, ignored = loop.run()
-    assert (command.size, rate.size, ignored) == (600, 600, 300)
-    np.testing.assert_array_equal(command[300:], loop.command)
-
-
 def test_run_of_a_history_takes_rates_as_models_do():
     history = History("x", np.arange(20.0) ** 2, np.arange(20.0), 100.0, ignore=3)
     _, rate, ignored = history.run()

@@ -9,7 +9,7 @@ import pytest
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.identify.evaluation import judgement_of
-from hilctl.identify.fit_api import FitData
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.model_page import refinement_page
 from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.refine import refinement

@@ -8,14 +8,14 @@ from scipy.optimize import lsq_linear, nnls
 
 from hilctl.base.types import F64
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.fit_api import FitData, FitRequest
+from hilctl.identify.fit_api import FitRequest
+from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import fit_model
 from hilctl.identify.least_squares import bounded_weights, first_least
 from hilctl.identify.searched.plays import (
     ExponentialProblem,
     PlaysProblem,
     SearchSpace,
-    refine_peak,
     search,
 )
 from hilctl.identify.settings import FitSettings
@@ -73,7 +73,7 @@ def test_samples_decide_where_they_can(data):
     assert np.linalg.norm(held) < 1.01 * np.linalg.norm(least)
 
 
-@pytest.mark.parametrize("choices", [{}, {"offset": True, "layout": "midpoint"}])
+@pytest.mark.parametrize("choices", [{}, {"offset": True}])
 def test_slopes_of_the_exponential_problem(data, choices):
     problem = ExponentialProblem(data, FitSettings(kind="integrated", **choices))
     x, ones = 1.1 * problem.space.guess + 0.01, np.ones(data.target_um.size)
@@ -133,15 +133,15 @@ def test_bounded_weights_agree_with_bounded_least_squares(offset):
 def test_several_starts_find_what_the_first_misses():
     problem, scale = Curve(3.0 * np.sin(23.0 * TIME)), np.ones(200)
     lonely = search(problem, scale, 6.0, 1, np.random.default_rng(0), quiet)
-    assert lonely.starts[0].rms_percent > 10.0
+    assert lonely[1][0].rms_percent > 10.0
     found = [search(problem, scale, 6.0, 6, np.random.default_rng(0), quiet) for _ in range(2)]
-    np.testing.assert_allclose(found[0].x, [3.0, 23.0], rtol=1e-6)
-    np.testing.assert_array_equal(found[0].x, found[1].x)
-    assert [start.start for start in found[0].starts] == [
+    np.testing.assert_allclose(found[0][0], [3.0, 23.0], rtol=1e-6)
+    np.testing.assert_array_equal(found[0][0], found[1][0])
+    assert [start.start for start in found[0][1]] == [
         "data",
         *[f"random {i}" for i in range(1, 6)],
     ]
-    assert all(start.rms_percent <= start.first_rms_percent for start in found[0].starts)
+    assert all(start.rms_percent <= start.first_rms_percent for start in found[0][1])
 
 
 def test_progress_rises_and_counts_starts():
@@ -159,27 +159,6 @@ def test_progress_rises_and_counts_starts():
     assert parts == sorted(parts)
     assert parts[0] == 0.0
     assert [text for _, text in told][:3] == [f"start {i} of 3" for i in (1, 2, 3)]
-
-
-def test_refinement_lowers_the_peak_at_the_cost_of_the_rms():
-    bump = np.exp(-(((TIME - 0.3) / 0.01) ** 2))
-    problem, scale = Curve(3.0 * np.sin(6.0 * TIME) + bump), np.ones(200)
-    found = search(problem, scale, 6.0, 3, np.random.default_rng(0), quiet)
-    before = problem.error_um(found.x, scale)
-    peak = float(np.max(np.abs(before)))
-    refined = refine_peak(problem, found, 0.8 * peak, quiet)
-    after = problem.error_um(refined.x, refined.scale)
-    assert np.max(np.abs(after)) <= 0.8 * peak
-    assert np.sum(after**2) > np.sum(before**2)
-
-
-def test_refinement_out_of_reach_keeps_the_best():
-    bump = np.exp(-(((TIME - 0.3) / 0.01) ** 2))
-    problem, scale = Curve(3.0 * np.sin(6.0 * TIME) + bump), np.ones(200)
-    found = search(problem, scale, 6.0, 3, np.random.default_rng(0), quiet)
-    refined = refine_peak(problem, found, 1e-3, quiet)
-    before = np.max(np.abs(problem.error_um(found.x, scale)))
-    assert np.max(np.abs(problem.error_um(refined.x, refined.scale))) < before
 
 
 def test_the_first_of_equal_ends_is_taken():

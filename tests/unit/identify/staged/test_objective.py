@@ -6,18 +6,16 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
-from hilctl.identify.fit_api import FitData
-from hilctl.identify.staged.fit_data import Linear, StagedFitData
+from hilctl.identify.fit_data import FitData, Linear
 from hilctl.identify.staged.objective import (
     Layers,
     Point,
     bounds,
     error_and_slopes,
+    in_loop,
     loop_delay_s,
     parameters,
-    response_um,
     staged_model,
-    stages_of,
     structure_of,
 )
 from hilctl.models.linear_stages import FirstMode
@@ -61,7 +59,7 @@ def test_the_longest_lag_leaves_half_a_period_and_none_a_whole_one():
 
 
 HALF_S = 1e-5
-LAYERS = Layers(plays=2, deadbands=1, half_period_s=HALF_S)
+LAYERS = Layers(plays=2, deadbands=1, half_period_s=HALF_S, staged=True)
 RADIAN_S = 1.0 / (2.0 * math.pi * 2000.0)
 POINT = Point(
     before=np.array([1e-4, 0.3, 0.5, 0.0]), linear=Linear(5e-5, 0.3 * RADIAN_S, RADIAN_S**2),
@@ -74,7 +72,7 @@ POINT = Point(
 def data(loops_of):
     omega = OMEGA.model_copy(update={"gamma_s": 0.0})
     loops = loops_of(omega, [(6.0, 100.0)])
-    return StagedFitData(loops, FitData(loops).speeds)
+    return FitData(loops)
 
 
 def test_a_low_pass_keeps_its_time_constant_and_is_a_structure():
@@ -89,25 +87,18 @@ def test_a_low_pass_keeps_its_time_constant_and_is_a_structure():
 
 
 def test_parameters_are_under_their_published_names():
-    found = parameters(LAYERS, POINT, staged=True)
+    found = parameters(LAYERS, POINT)
     assert found["delay_s"] == 5e-5
     assert (found["a_1"], found["a_2"], found["g_0"]) == (1.0, 0.5, 1.0)
     assert found["g_1"] == pytest.approx(-0.2)
     assert found["g_-1"] == pytest.approx(0.2)
-    assert "delay_s" not in parameters(LAYERS, POINT, staged=False)
+    assert "delay_s" not in parameters(replace(LAYERS, staged=False), POINT)
 
 
-def test_a_model_has_the_stages_of_its_point_and_gives_them_back(data):
-    model = staged_model(data, LAYERS, POINT, "A")
+def test_a_model_has_the_stages_of_its_point(data):
+    model = staged_model(data, LAYERS, POINT)
     assert (model.lag.tau_s, model.lag.growth_per_unit) == (1e-4, 0.3)
     assert model.structure.natural_hz == pytest.approx(2000.0)
     assert model.hysteresis.thresholds == pytest.approx((0.5, 1.0))
-    back = stages_of(model, HALF_S)
-    assert back.delay_s == pytest.approx(POINT.linear.delay_s + loop_delay_s(HALF_S, 1e-4))
-    assert (back.c_s, back.q_s2) == pytest.approx((POINT.linear.c_s, POINT.linear.q_s2))
-
-
-def test_the_response_is_moved_by_the_offset(data):
-    model = staged_model(data, LAYERS, POINT, "A")
-    moved = model.model_copy(update={"output_offset_um": model.output_offset_um + 3.0})
-    np.testing.assert_allclose(response_um(moved, data), response_um(model, data) + 3.0)
+    late_s = POINT.linear.delay_s + loop_delay_s(HALF_S, 1e-4)
+    assert in_loop(LAYERS, POINT) == replace(POINT.linear, delay_s=late_s)

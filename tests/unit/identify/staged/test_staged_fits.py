@@ -9,7 +9,7 @@ import pytest
 from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judge
-from hilctl.identify.staged.fit_data import SPACING, Linear
+from hilctl.identify.fit_data import SPACING, Linear
 from hilctl.identify.staged.objective import DYNAMIC, Layers, Point, error_and_slopes
 from hilctl.identify.staged.staged_fits import StagedEnd, at_bound, standard_errors
 from hilctl.models.implicit_models import PreisachModel
@@ -143,32 +143,23 @@ def ended(noise_um, free, seed=1, bound=()):
 
 def test_records_that_differ_by_so_much_give_so_much_over_their_root():
     """Each record's own a_0 scatters by 0.5: the mean of 40 is known to 0.5 / sqrt(40)."""
-    found = standard_errors(ended(0.5, [DYNAMIC]), LAYERS, PLACES, staged=True)
+    found = standard_errors(ended(0.5, [DYNAMIC]), LAYERS, PLACES)
     assert found.keys() == {"a_0"}
     assert found["a_0"] == pytest.approx(0.5 / np.sqrt(RECORDS), rel=0.25)
 
 
 def test_a_parameter_that_was_not_free_has_none():
-    free = standard_errors(ended(0.5, [DYNAMIC, SPACING]), LAYERS, PLACES, staged=True)
+    free = standard_errors(ended(0.5, [DYNAMIC, SPACING]), LAYERS, PLACES)
     assert free.keys() == {"a_0", "alpha"}
 
 
 def test_one_record_disagrees_with_nobody():
-    assert standard_errors(ended(0.5, [DYNAMIC]), LAYERS, PLACES[:1], staged=True) == {}
+    assert standard_errors(ended(0.5, [DYNAMIC]), LAYERS, PLACES[:1]) == {}
 
 
 def test_what_a_bound_holds_is_named():
-    held = at_bound(ended(0.5, [], bound=[0, SPACING, DYNAMIC + 1]), LAYERS, staged=True)
+    held = at_bound(ended(0.5, [], bound=[0, SPACING, DYNAMIC + 1]), LAYERS)
     assert held == ("alpha", "a_1")
-
-
-def test_peak_goal_lowers_the_peak(loops_of):
-    made = truth(lag=FieldLag(tau_s=1e-4, growth_per_unit=0.3))
-    loops = loops_of(made, GRID[::2])
-    choices = {"structure": False, "delay": False, "lag": "plain"}
-    plain = fit(loops, **choices)
-    refined = fit(loops, peak_goal_percent=0.8 * plain.peak_percent, **choices)
-    assert refined.peak_percent < plain.peak_percent
 
 
 def test_whole_histories_and_wrong_choices_are_refused(loops_of):

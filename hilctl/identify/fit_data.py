@@ -1,20 +1,29 @@
-"""Records for a fit with dynamics: lag and plays in time, structure and delay by harmonics."""
+"""Records prepared for a fit: plays and lag are computed in time, the rest by harmonics."""
 
 import math
 from collections.abc import Callable, Sequence
 from copy import copy
 from dataclasses import dataclass, replace
-from typing import TypeAlias
+from functools import cached_property
+from typing import Any, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 from scipy.fft import irfft, rfft
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64
-from hilctl.identify.data.records import Record, Records, SteadyLoop
+from hilctl.base.types import F64, CommandUnit
+from hilctl.identify.data.records import History, Record, Records, SteadyLoop
+from hilctl.kernels.hysteresis import play_outputs, play_sum_shared, rest_memory
 from hilctl.kernels.jit import kernel
-from hilctl.models.base import Operator
+from hilctl.models.integrated import ButterflyModel, IntegratedModel
+from hilctl.models.plays import PlayModel
+
+PERIODS = 3
+"""Simulated periods of a loop; the last is evaluated, since differential models settle slowly."""
+
+CREEP_S = 0.1  # time constant in the law of creep
+BEYOND = 0.15  # of half the range: margin of commands that an inverse may output
 
 LAG_S, GROWTH, SPACING, GAMMA_S = range(4)
 """Columns of derivatives by the parameters before the deadbands."""
@@ -90,10 +99,9 @@ def plays_and_slopes(
 ) -> None:
     """Run plays of thresholds ``spacing numbers_i + gamma speed``, from rest.
 
-    The last of ``turns`` repetitions counts; two give the steady cycle, see
-    :meth:`hilctl.identify.data.records.SteadyLoop.run`. Fill in each play's output, float64[n, m],
-    and the derivatives of their weighted sum by the parameters, float64[n, 4]; ``dw`` holds those
-    of the input.
+    The last of ``turns`` repetitions counts; two give the steady cycle. Fill in each play's output,
+    float64[n, m], and the derivatives of their weighted sum by the parameters, float64[n, 4]. Those
+    of the input are in ``dw``.
     """
     held = np.zeros(numbers.size)
     by = np.zeros((numbers.size, 4))
@@ -121,6 +129,8 @@ def plays_and_slopes(
 
 
 Spectrum: TypeAlias = npt.NDArray[np.complex128]
+Lagged: TypeAlias = tuple[list[F64], list[F64]]
+"""Each record's command after a lag, and its derivatives float64[n, 4]."""
 SETTLED = 20.0  # time constants until a lag is settled
 MOST_SUBSTEPS = 200
 WITHOUT_STAGES = (
@@ -159,6 +169,25 @@ class _Run:
     step_s: float
     s: Spectrum | None
 
+    @classmethod
+    def of(cls, record: Record, place: slice) -> "_Run":
+        """Return the run of a record: one steady cycle, or a whole history."""
+        if isinstance(record, SteadyLoop):
+            size = record.command.size
+            harmonics = np.arange(size // 2 + 1)
+            s = np.asarray(2j * math.pi * record.frequency_hz * harmonics, dtype=np.complex128)
+            command, rate, judged = record.command, record.rate(), slice(0, size)
+            step_s = 1.0 / (size * record.frequency_hz)
+        else:
+            command, rate, ignored = record.run()
+            judged, step_s, s = slice(ignored, command.size), 1.0 / record.sample_rate_hz, None
+        return cls(np.ascontiguousarray(command), np.abs(rate), judged, place, step_s, s)
+
+    @property
+    def turns(self) -> int:
+        """Repetitions from rest: one brings every play to its periodic state, the last counts."""
+        return 1 if self.s is None else 2
+
     def every(self, step: int) -> "_Run":
         """Return every ``step``-th point of a steady cycle."""
         if step == 1 or self.s is None:
@@ -169,34 +198,52 @@ class _Run:
         return _Run(command, speed, part, part, step_s, self.s[: command.size // 2 + 1])
 
 
-class StagedFitData:
-    """Commands and displacements of all records, with evaluated samples in sequence.
+class FitData:
+    """Commands, rates and evaluated displacements of all records.
 
-    See :class:`hilctl.identify.fit_api.FitData` for the attributes; ``top_hz`` is the highest
-    frequency of a loop (for histories, of a sine as fast as they are) and ``half_period_s`` is 0.0
-    if the sample rate is unknown.
+    Attributes:
+        target_um: float64[N], measured displacement of all evaluated samples.
+        places: For each record, its part of the N samples.
+        reach: Half the largest peak-to-peak command; plays with a larger threshold do not move in a
+            steady cycle.
+        speed: Largest |rate| of the command, in command units per second.
+        top_hz: Highest frequency of a loop; for histories, of a sine as fast as they are.
+        half_period_s: Half a sample period of the loop; 0.0 if the sample rate is unknown.
+        stroke_um: Largest peak-to-peak displacement of a record.
+        output_range_um: Lowest and highest evaluated displacement.
     """
 
-    def __init__(self, data: Records, speeds: Sequence[F64]) -> None:
-        runs = [_run(record, speed) for record, speed in zip(data, speeds, strict=True)]
-        targets = [r.displacement_um[run.judged] for r, run in zip(data, runs, strict=True)]
+    def __init__(self, records: Records, unit: CommandUnit = "A") -> None:
+        if not records:
+            raise DataError("no records to fit: the list of loops and histories is empty")
+        self.records = tuple(records)
+        self.unit = unit
+        runs = [_Run.of(record, slice(0)) for record in self.records]
+        pairs = zip(self.records, runs, strict=True)
+        targets = [record.displacement_um[run.judged] for record, run in pairs]
         self._keep(runs, np.concatenate(targets))
-        self.reach = max(0.5 * float(np.ptp(run.command)) for run in self._runs)
-        self.top_speed = max(float(run.speed.max()) for run in self._runs)
-        loops = [record for record in data if isinstance(record, SteadyLoop)]
-        turning = self.top_speed / (2.0 * math.pi * self.reach)
-        self.top_hz = max((loop.frequency_hz for loop in loops), default=turning)
-        self.stroke_um = max(float(np.ptp(target)) for target in targets)
-        rates = {record.sample_rate_hz for record in data}
+        self.reach = max(0.5 * float(np.ptp(run.command)) for run in runs)
+        self.speed = max(float(run.speed.max()) for run in runs)
+        turning = self.speed / (2.0 * math.pi * self.reach)
+        self.top_hz = max((loop.frequency_hz for loop in self.loops), default=turning)
+        rates = {record.sample_rate_hz for record in self.records}
         self.one_rate = len(rates) == 1
         self.half_period_s = 0.5 / max(rates) if min(rates) > 0.0 else 0.0
+        self.stroke_um = max(float(np.ptp(target)) for target in targets)
         self.input_range = (
-            min(float(run.command.min()) for run in self._runs),
-            max(float(run.command.max()) for run in self._runs),
+            min(float(run.command.min()) for run in runs),
+            max(float(run.command.max()) for run in runs),
         )
         self.output_range_um = (float(self.target_um.min()), float(self.target_um.max()))
 
-    def thinned(self, scale: F64, points: int) -> tuple["StagedFitData", F64]:
+    def _keep(self, runs: Sequence[_Run], target_um: F64) -> None:
+        ends = np.cumsum([0, *(_size(run.judged) for run in runs)]).tolist()
+        self.places = tuple(map(slice, ends[:-1], ends[1:]))
+        placed = zip(runs, self.places, strict=True)
+        self._runs = [replace(run, place=place) for run, place in placed]
+        self.target_um = target_um
+
+    def thinned(self, scale: F64, points: int) -> tuple["FitData", F64]:
         """Return the data with about ``points`` per loop and whole histories, and their scale."""
         kept, runs = np.zeros(scale.size, dtype=bool), []
         for run in self._runs:
@@ -207,10 +254,29 @@ class StagedFitData:
         few._keep(runs, self.target_um[kept])  # noqa: SLF001  a copy of the same class
         return few, scale[kept]
 
-    def _keep(self, runs: Sequence[_Run], target_um: F64) -> None:
-        self._runs = _placed(runs)
-        self.target_um = target_um
-        self.places = tuple(run.place for run in self._runs)
+    @cached_property
+    def creep(self) -> F64:
+        """Columns of a constant per record and ln(1 + t / 0.1 s) per history, float64[N, f]."""
+        columns: list[F64] = []
+        for record, place in zip(self.records, self.places, strict=True):
+            part = np.ones((place.stop - place.start, 1))
+            if isinstance(record, History):
+                time_s = record.time_s[record.ignore :]
+                part = np.column_stack([part, np.log1p(time_s / CREEP_S)])
+            column = np.zeros((self.target_um.size, part.shape[1]))
+            column[place] = part
+            columns.append(column)
+        return np.hstack(columns)
+
+    def with_creep(self, responses_um: F64) -> F64:
+        """Return responses with the offset and creep of each record that fit best: float64[N]."""
+        own = np.linalg.lstsq(self.creep, self.target_um - responses_um, rcond=None)[0]
+        return responses_um + self.creep @ own
+
+    @property
+    def loops(self) -> tuple[SteadyLoop, ...]:
+        """The records that are steady loops."""
+        return tuple(record for record in self.records if isinstance(record, SteadyLoop))
 
     @property
     def gain(self) -> float:
@@ -218,11 +284,42 @@ class StagedFitData:
         return self.stroke_um / (2.0 * self.reach)
 
     @property
+    def command_span(self) -> tuple[float, float]:
+        """The range of the command plus 15 %, for inverses that need a bounded range."""
+        low, high = self.input_range
+        more = BEYOND * 0.5 * (high - low)
+        return low - more, high + more
+
+    @property
     def all_steady(self) -> bool:
         """Whether every record is a steady loop, as dynamic stages need."""
         return all(run.s is not None for run in self._runs)
 
-    def lagged(self, lag_s: float, growth: float) -> tuple[list[F64], list[F64]]:
+    def play_sum(self, direct: float, thresholds: F64, weights: F64, growth_s: float) -> F64:
+        """Return ``direct v + sum weights_i F_i[v]`` of all evaluated samples: float64[N]."""
+        out = np.empty(self.target_um.size)
+        for run in self._runs:
+            response, memory = np.empty(run.command.size), rest_memory(thresholds.size)
+            for _ in range(run.turns):
+                play_sum_shared(
+                    run.command, growth_s * run.speed, direct, thresholds, weights, memory, response
+                )
+            out[run.place] = response[run.judged]
+        return out
+
+    def columns(self, thresholds: F64, growth_s: float = 0.0) -> F64:
+        """Return command and output of each play for all evaluated samples: float64[N, n + 1]."""
+        out = np.empty((self.target_um.size, thresholds.size + 1))
+        for run in self._runs:
+            response = np.empty((run.command.size, thresholds.size))
+            memory = rest_memory(thresholds.size)
+            for _ in range(run.turns):
+                play_outputs(run.command, growth_s * run.speed, thresholds, memory, response)
+            out[run.place, 0] = run.command[run.judged]
+            out[run.place, 1:] = response[run.judged]
+        return out
+
+    def lagged(self, lag_s: float, growth: float) -> Lagged:
         """Return each record's command after a lag, and its derivatives float64[n, 4]."""
         out = [run.command.copy() for run in self._runs]
         slopes = [np.zeros((run.command.size, PARAMETERS)) for run in self._runs]
@@ -234,29 +331,27 @@ class StagedFitData:
         return out, slopes
 
     def plays(
-        self, lagged: tuple[list[F64], list[F64]], before: F64, numbers: F64, weights: F64
+        self, before: F64, numbers: F64, weights: F64, lagged: Lagged | None = None
     ) -> tuple[F64, F64, F64]:
-        """Run plays on the result of :meth:`lagged`."""
-        # Returns input float64[N], outputs float64[N, n], slopes of input and sum float64[2, N, 4].
+        """Run plays of thresholds ``spacing numbers_i``, after a lag if the commands have one.
+
+        ``before`` holds lag, growth, spacing and gamma. Return the input float64[N], each play's
+        output float64[N, n], and the derivatives of input and weighted sum by ``before``,
+        float64[2, N, 4].
+        """
         size = self.target_um.size
         inputs, outputs = np.empty(size), np.empty((size, numbers.size))
         slopes = np.empty((2, size, PARAMETERS))
-        for run, w, dw in zip(self._runs, *lagged, strict=True):
+        spacing, gamma_s = float(before[SPACING]), float(before[GAMMA_S])
+        commands = lagged or self.lagged(0.0, 0.0)
+        for run, w, dw in zip(self._runs, *commands, strict=True):
             out, by = np.empty((w.size, numbers.size)), np.empty((w.size, PARAMETERS))
-            turns = 1 if run.s is None else 2
-            spacing, gamma_s = float(before[2]), float(before[3])
-            plays_and_slopes(w, dw, run.speed, spacing, gamma_s, numbers, weights, turns, out, by)
+            plays_and_slopes(
+                w, dw, run.speed, spacing, gamma_s, numbers, weights, run.turns, out, by
+            )
             inputs[run.place], outputs[run.place] = w[run.judged], out[run.judged]
             slopes[0, run.place], slopes[1, run.place] = dw[run.judged], by[run.judged]
         return inputs, outputs, slopes
-
-    def respond(self, lagged: list[F64], operator: Callable[[], Operator]) -> F64:
-        """Run an operator, new for each record, on commands after a lag: float64[N]."""
-        out = np.empty(self.target_um.size)
-        for run, w in zip(self._runs, lagged, strict=True):
-            signal = w if run.s is None else np.tile(w, 2)
-            out[run.place] = operator().process(signal)[signal.size - w.size :][run.judged]
-        return out
 
     def through(self, signals: F64, linear: Linear) -> F64:
         """Return the response of the linear stages to signals float64[N, k]."""
@@ -286,12 +381,36 @@ class StagedFitData:
             out[run.place] = irfft(stacked, _size(run.place), axis=0)
         return out
 
+    def response_um(self, model: PlayModel) -> F64:
+        """Return a model's displacement of all evaluated samples: float64[N]."""
+        x = self.play_sum(
+            model.direct,
+            np.array(model.thresholds),
+            np.array(model.weights),
+            model.threshold_growth_s,
+        )
+        if isinstance(model, IntegratedModel):
+            x = model.deadband(x)
+        elif isinstance(model, ButterflyModel):
+            x = model.shape(np.abs(x + model.bias))
+        return x + model.output_offset_um
 
-def _placed(runs: Sequence[_Run]) -> list[_Run]:
-    """Set the place of each run after that of the one before."""
-    ends = np.cumsum([0, *(_size(run.judged) for run in runs)]).tolist()
-    places = map(slice, ends[:-1], ends[1:])
-    return [replace(run, place=place) for run, place in zip(runs, places, strict=True)]
+    def stack(self, run: Callable[[F64], F64]) -> F64:
+        """Stack a rate-independent function of each command, float64[N] or float64[N, m]."""
+        parts = []
+        for record, place in zip(self.records, self.places, strict=True):
+            periods = PERIODS if isinstance(record, SteadyLoop) else 1
+            parts.append(run(np.tile(record.command, periods))[place.start - place.stop :])
+        return np.concatenate(parts)
+
+    def common(self, offset_um: float) -> dict[str, Any]:
+        """Return the fields that every model has, by name."""
+        return {
+            "input_unit": self.unit,
+            "input_range": self.input_range,
+            "output_range_um": self.output_range_um,
+            "output_offset_um": offset_um,
+        }
 
 
 def _size(place: slice) -> int:
@@ -302,14 +421,3 @@ def _harmonics(run: _Run) -> Spectrum:
     if run.s is None:
         raise DataError(f"lag, structure and delay need steady loops: {WITHOUT_STAGES}")
     return run.s
-
-
-def _run(record: Record, speed: F64) -> _Run:
-    size, command = record.command.size, np.ascontiguousarray(record.command)
-    if isinstance(record, SteadyLoop):
-        harmonics = np.arange(size // 2 + 1)
-        s = np.asarray(2j * math.pi * record.frequency_hz * harmonics, dtype=np.complex128)
-        whole = slice(0, size)
-        return _Run(command, speed, whole, whole, 1.0 / (size * record.frequency_hz), s)
-    judged = slice(record.ignore, size)
-    return _Run(command, speed, judged, judged, 1.0 / record.sample_rate_hz, None)

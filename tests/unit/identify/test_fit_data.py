@@ -5,13 +5,7 @@ import pytest
 from scipy.integrate import solve_ivp
 
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.staged.fit_data import (
-    PARAMETERS,
-    Linear,
-    StagedFitData,
-    lagged,
-    plays_and_slopes,
-)
+from hilctl.identify.fit_data import PARAMETERS, FitData, Linear, lagged, plays_and_slopes
 
 POINTS, FREQUENCY_HZ = 300, 100.0
 PHASE = 2.0 * np.pi * np.arange(POINTS) / POINTS
@@ -22,12 +16,8 @@ def loop(amplitude=6.0, frequency_hz=FREQUENCY_HZ):
     return SteadyLoop(f"{amplitude}", command, 5.0 * command + 1.0, frequency_hz, 50_000.0)
 
 
-def data_of(*records):
-    return StagedFitData(records, [np.abs(record.rate()) for record in records])
-
-
 def test_a_delay_moves_each_loop_by_its_own_time():
-    data = data_of(loop(), loop(3.0, 50.0))
+    data = FitData([loop(), loop(3.0, 50.0)])
     late = data.through(data.target_um[:, None], Linear(delay_s=1e-3))[:, 0]
     moved = np.concatenate([
         1.0 + 30.0 * np.sin(PHASE - 2.0 * np.pi * 100.0 * 1e-3),
@@ -39,7 +29,7 @@ def test_a_delay_moves_each_loop_by_its_own_time():
 
 
 def test_a_lag_keeps_the_mean_and_lowers_the_swing():
-    data = data_of(loop())
+    data = FitData([loop()])
     (after,), (slopes,) = data.lagged(1e-3, 0.0)
     gain = 1.0 / abs(1.0 + 2j * np.pi * FREQUENCY_HZ * 1e-3)
     assert np.ptp(after) == pytest.approx(12.0 * gain, rel=1e-3)
