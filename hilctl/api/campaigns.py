@@ -12,8 +12,7 @@ from hilctl.base.files import check_no_input, check_writable
 from hilctl.base.table import Column
 from hilctl.experiment.correction import write_correction
 from hilctl.experiment.load import inputs_of
-from hilctl.ilc.ilc_session import IlcSession
-from hilctl.ilc.results import IlcResult, IlcRow
+from hilctl.ilc.ilc_session import IlcResult, IlcRow, IlcSession
 from hilctl.recording.run_summary import recordings_in
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.start import paced, unpaced, unused

@@ -1,6 +1,5 @@
 """Identify, refine, compare, load and export models."""
 
-import time
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from datetime import UTC, datetime
@@ -232,15 +231,15 @@ def compare(
         kinds = models or list(library.COMPARED)
         library.check_free(kinds, Path(save), overwrite=overwrite, inputs=inputs)
     finish_dead_runs()
-    request = library.ComparisonRequest(
-        recordings=paths_of(recordings),
-        models=models,
+    comparison = library.compare(
+        paths_of(recordings),
+        models,
         experiment=path_or_none(experiment),
         settings=texts_of(settings),
         frequencies_hz=frequencies_hz,
         points=library.POINTS if points is None else points,
+        progress=on_progress,
     )
-    comparison = library.compare(request, time.perf_counter, on_progress)
     if html is not None:
         from hilctl.analysis.html import write_page  # it imports matplotlib
         from hilctl.comparison.comparison_page import comparison_page

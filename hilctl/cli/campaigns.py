@@ -31,8 +31,7 @@ from hilctl.cli.options import (
 )
 from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.sections import label_settings
-from hilctl.ilc.ilc_session import correction_setting
-from hilctl.ilc.results import IlcResult, IlcRow
+from hilctl.ilc.ilc_session import IlcResult, IlcRow, correction_setting
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.studies.campaign.campaign_runner import CampaignHost, CampaignResult
 from hilctl.studies.campaign.plan import CampaignPlan

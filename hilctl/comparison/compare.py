@@ -1,12 +1,13 @@
 """Compare models: identify and evaluate them on the same loops, try them on the same device."""
 
+import time
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import already_there, check_no_input, write_text
+from hilctl.base.files import already_there, check_no_input, make_folder, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document
 from hilctl.comparison.simulated_trials import (
@@ -17,10 +18,10 @@ from hilctl.comparison.simulated_trials import (
     waveforms_of,
 )
 from hilctl.experiment.load import LoadedExperiment, load_experiment, resolve
-from hilctl.identify.data.cycles import loops_from_recording
+from hilctl.identify.data.cycles import loops_from_pieces
 from hilctl.identify.data.records import SteadyLoop
 from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import FitRequest, OnProgress
+from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import FittedModel, fit_model
 from hilctl.identify.registry import entry
@@ -53,27 +54,6 @@ COMPARED: Mapping[FitKind, Mapping[str, Any]] = {
 }
 """Default kinds, the reference first, with comparable settings. Without spi, which has the loops of
 ppi, and butterfly, which is for rods without a bias."""
-
-
-@dataclass(frozen=True, slots=True)
-class ComparisonRequest:
-    """Request of a comparison.
-
-    Attributes:
-        models: Kinds of model, or model files; empty for :data:`COMPARED`.
-        experiment: Experiment with device, limits and waveform of the trials; None for device and
-            limits of the first recording and a sine over nearly the complete stroke.
-        settings: ``key=value`` texts over the experiment.
-        frequencies_hz: Frequencies of the trials; None for the lowest, the middle and the highest
-            of the loops with a sine or a triangle, and for the unchanged waveform otherwise.
-    """
-
-    recordings: Sequence[Path]
-    models: Sequence[str] = ()
-    experiment: Path | None = None
-    settings: Sequence[str] = ()
-    frequencies_hz: Sequence[float] | None = None
-    points: int = POINTS
 
 
 @dataclass(frozen=True, slots=True)
@@ -146,34 +126,54 @@ def _row_mapping(loops: Sequence[SteadyLoop], row: ComparedModel) -> dict[str, A
 
 
 def compare(
-    request: ComparisonRequest, clock: Callable[[], float], progress: OnProgress
+    recordings: Sequence[Path],
+    models: Sequence[str] = (),  # kinds of model, or model files; empty for COMPARED
+    *,
+    experiment: Path | None = None,
+    settings: Sequence[str] = (),
+    frequencies_hz: Sequence[float] | None = None,
+    points: int = POINTS,
+    clock: Callable[[], float] = time.perf_counter,
+    progress: OnProgress = ignore_progress,
 ) -> Comparison:
-    """Identify each model on the loops, evaluate it, and try its inverse on the device."""
-    names = tuple(request.models) or tuple(COMPARED)
+    """Identify each model on the loops, evaluate it, and try its inverse on the device.
+
+    Args:
+        recordings: Recordings of steady loops.
+        models: Kinds of model, or model files; empty for :data:`COMPARED`.
+        experiment: Experiment with device, limits and waveform of the trials; None for device and
+            limits of the first recording and a sine over nearly the complete stroke.
+        settings: ``key=value`` texts over the experiment.
+        frequencies_hz: Frequencies of the trials; None for the lowest, the middle and the highest
+            of the loops with a sine or a triangle, and for the unchanged waveform otherwise.
+        points: Points per loop.
+        clock: Time in s.
+        progress: Called with the part that is done.
+    """
+    names = tuple(models) or tuple(COMPARED)
     for name in names:
         if not name.endswith(_FILES):
             entry(name)
-    recordings = [read(path) for path in request.recordings]
-    data = _loops(recordings, request.points)
-    sources = tuple(path.name for path in request.recordings)
-    device = _device(request, recordings[0], data)
+    recorded = [read(path) for path in recordings]
+    data = _loops(recorded, points)
+    sources = tuple(path.name for path in recordings)
+    device = _device(experiment, settings, frequencies_hz, recorded[0], data)
     rows: list[ComparedModel] = []
     for i, name in enumerate(names):
 
         def tell(part: float, text: str, i: int = i, name: str = name) -> None:
             progress((i + part) / len(names), f"{name}: {text}")
 
-        rows.append(_row(name, data, sources, recordings[0].sample_rate_hz, device, clock, tell))
+        rows.append(_row(name, data, sources, recorded[0].sample_rate_hz, device, clock, tell))
     progress(1.0, "done")
-    described = device.description if device else ""
-    return Comparison(sources, described, data.loops, tuple(rows))
+    return Comparison(sources, device.description if device else "", data.loops, tuple(rows))
 
 
 def _loops(recordings: Sequence[Recording], points: int) -> FitData:
     units = {recording.command_unit for recording in recordings}
     if len(units) != 1:
         raise InputError("recordings in A and in V cannot be combined")
-    loops = [loop for recording in recordings for loop in loops_from_recording(recording, points)]
+    loops = [loop for recording in recordings for loop in loops_from_pieces([recording], points)]
     return FitData(loops, units.pop())
 
 
@@ -221,16 +221,21 @@ def _trials(
         yield from device.run(model, reference)
 
 
-def _device(request: ComparisonRequest, recording: Recording, data: FitData) -> TrialDevice | None:
+def _device(
+    experiment: Path | None,
+    settings: Sequence[str],
+    frequencies: Sequence[float] | None,
+    recording: Recording,
+    data: FitData,
+) -> TrialDevice | None:
     """Return the device of the trials; None if the recording has a real device."""
-    frequencies = request.frequencies_hz
-    if request.experiment is not None:
-        loaded = load_experiment(request.experiment, request.settings)
+    if experiment is not None:
+        loaded = load_experiment(experiment, settings)
         waveform = loaded.config.waveform
         if frequencies is None and waveform.kind in ("sine", "triangle"):
             frequencies = _frequencies_hz(data.loops)
         return TrialDevice(loaded, waveforms_of(waveform, frequencies))
-    recorded = _recorded(recording, request.settings)
+    recorded = _recorded(recording, settings)
     if recorded is None:
         return None
     waveforms = waveforms_of(full_stroke(data.loops), frequencies or _frequencies_hz(data.loops))
@@ -268,10 +273,8 @@ def check_free(
         raise already_there(taken[0], "give another --save, or --overwrite")
 
 
-def save_models(
-    comparison: Comparison, folder: Path, *, created: str, overwrite: bool
-) -> tuple[Path, ...]:
-    """Write each identified model to ``folder/NAME.yaml``, and return the files.
+def save_models(comparison: Comparison, folder: Path, *, created: str, overwrite: bool) -> None:
+    """Write each identified model to ``folder/NAME.yaml``.
 
     Models from files are skipped; ``created`` is an ISO 8601 date and time in UTC, for the
     provenance. Raise InputError if a file exists, and write nothing, or if the folder is not
@@ -279,18 +282,11 @@ def save_models(
     """
     rows = [row for row in comparison.rows if row.identify_s is not None]
     check_free([row.name for row in rows], folder, overwrite=overwrite)
-    paths = []
-    try:
-        folder.mkdir(parents=True, exist_ok=True)
-        for row in rows:
-            path = folder / f"{row.name}.yaml"
-            provenance = row.model.provenance.model_copy(update={"created": created})
-            model = row.model.model_copy(update={"provenance": provenance})
-            write_text(path, dump_model(model), overwrite=overwrite)
-            paths.append(path)
-    except OSError as error:
-        raise InputError(f"{folder}: can't be written: {error.strerror}") from None
-    return tuple(paths)
+    make_folder(folder)
+    for row in rows:
+        provenance = row.model.provenance.model_copy(update={"created": created})
+        model = row.model.model_copy(update={"provenance": provenance})
+        write_text(folder / f"{row.name}.yaml", dump_model(model), overwrite=overwrite)
 
 
 def headings(comparison: Comparison) -> list[str]:

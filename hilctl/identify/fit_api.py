@@ -7,7 +7,7 @@ from typing import TypeAlias
 from hilctl.base.types import CommandUnit
 from hilctl.identify.data.records import Record
 from hilctl.identify.fit_data import FitData
-from hilctl.identify.parallel import MapFunction, serial_map
+from hilctl.identify.parallel import MapFunction
 from hilctl.identify.settings import FitSettings
 from hilctl.models.base import HysteresisModel
 from hilctl.models.linear_stages import FirstMode, FurtherMode
@@ -34,7 +34,7 @@ class FitRequest:
     settings: FitSettings
     unit: CommandUnit = "A"
     source: Sequence[str] = ()  # names of recordings or files, for the provenance
-    run: MapFunction = serial_map
+    run: MapFunction = map
     progress: OnProgress = ignore_progress
     start: object | None = None  # start of the search, see :class:`FitJob`
     structure: FirstMode | None = None  # measured first mode, near which histories are fitted
@@ -48,7 +48,7 @@ class FitJob:
 
     data: FitData
     settings: FitSettings
-    run: MapFunction = serial_map
+    run: MapFunction = map
     progress: OnProgress = ignore_progress
     start: object | None = None
     structure: Structure = True

@@ -18,7 +18,7 @@ from hilctl.identify.evaluation import Evaluation, judge, judgement_of
 from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import creeps, fit_kind, fit_model
-from hilctl.identify.parallel import MapFunction, serial_map
+from hilctl.identify.parallel import MapFunction
 from hilctl.identify.settings import FitSettings, IdentifySettings
 
 FEWEST_LOOPS = 4
@@ -98,7 +98,7 @@ def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[He
             request,
             records=fold.fitted,
             settings=request.settings.model_copy(update={"starts": 1}),
-            run=serial_map,
+            run=map,
             progress=ignore_progress,
         ))
         for number, request in enumerate(requests)
@@ -367,7 +367,7 @@ def choose_lag(
     progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
     lean = settings.model_copy(update={"starts": 1})
     requests = [FitRequest(tuple(load(lag)), lean) for lag in range(MOST_LAG + 1)]
-    return int(np.argmin(run(_rms_um, requests)))
+    return int(np.argmin(list(run(_rms_um, requests))))
 
 
 def _rms_um(request: FitRequest) -> float:

@@ -15,17 +15,8 @@ Task = TypeVar("Task")
 Result = TypeVar("Result")
 SCHEDULERS = ("none", "threads", "processes")
 
-
-MapFunction: TypeAlias = Callable[[Callable[[Any], Any], Sequence[Any]], list[Any]]
-"""Runs a function on each task and returns the results in the order of the tasks."""
-
-StreamFunction: TypeAlias = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
-"""Runs a function on each task and yields the results in the order of the tasks."""
-
-
-def serial_map(function: Callable[[Task], Result], tasks: Sequence[Task], /) -> list[Result]:
-    """Run tasks one after the other."""
-    return [function(task) for task in tasks]
+MapFunction: TypeAlias = Callable[[Callable[[Any], Any], Sequence[Any]], Iterator[Any]]
+"""Runs a function on each task and yields the results in the order of the tasks; ``map`` does."""
 
 
 def parallel_map(function: Callable[[Task], Result], tasks: Iterable[Task], /) -> list[Result]:
@@ -45,7 +36,7 @@ class _UnwantedError(Exception):
 
 
 _worker = threading.local()
-"""Has an event ``unwanted`` in threads of :func:`streams`, which cancels their tasks."""
+"""Has an event ``unwanted`` in threads of :func:`workers`, which cancels their tasks."""
 
 
 @cache
@@ -58,14 +49,7 @@ def _threads() -> ThreadPoolExecutor:
 
 @contextmanager
 def workers(scheduler: str = "none") -> Iterator[MapFunction]:
-    """Yield a :data:`MapFunction`; see :func:`streams`."""
-    with streams(scheduler) as stream:
-        yield lambda function, tasks: list(stream(function, tasks))
-
-
-@contextmanager
-def streams(scheduler: str = "none") -> Iterator[StreamFunction]:
-    """Yield a :data:`StreamFunction`; results do not depend on the scheduler.
+    """Yield a :data:`MapFunction`; results do not depend on the scheduler.
 
     Args:
         scheduler: ``none`` for serial, ``threads`` or ``processes`` on this machine,
@@ -108,7 +92,7 @@ def _local(scheduler: str) -> Iterator[Executor]:
 
 
 @contextmanager
-def _dask(address: str) -> Iterator[StreamFunction]:
+def _dask(address: str) -> Iterator[MapFunction]:
     try:
         from distributed import Client
     except ImportError:
@@ -120,6 +104,4 @@ def _dask(address: str) -> Iterator[StreamFunction]:
     except (OSError, ValueError) as error:
         raise InputError(f"no Dask scheduler answers at {address}: {error}") from None
     with client:
-        yield lambda function, tasks: (
-            each.result() for each in client.map(function, list(tasks), pure=False)
-        )
+        yield client.get_executor(pure=False).map

@@ -37,7 +37,7 @@ from hilctl.base.errors import ConfigError, HilctlError
 from hilctl.base.segments import Segment
 from hilctl.cli.reports import render_report
 from hilctl.experiment.device_state import initial_state_after
-from hilctl.identify.data.cycles import loops_from_recording
+from hilctl.identify.data.cycles import loops_from_pieces
 from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.kernels.hysteresis import play_sum
 from hilctl.models.base import HysteresisModel
@@ -352,7 +352,7 @@ def _pieces(_recording: Recording, path: Path) -> None:
 def _identify(recording: Recording, _path: Path) -> None:
     with suppress(HilctlError):
         history_from_pieces([recording])
-    loops_from_recording(recording)
+    loops_from_pieces([recording])
 
 
 def _initial_state(recording: Recording, path: Path) -> None:

@@ -175,13 +175,6 @@ def average_cycle(label: str, phase: F64, values: F64, period: float, points: in
     return mean.cycle()
 
 
-def loops_from_recording(
-    recording: Recording, points: int = 300, labels: Collection[str] = ()
-) -> tuple[SteadyLoop, ...]:
-    """Return the averaged steady cycle of each segment, see :func:`loops_from_pieces`."""
-    return loops_from_pieces([recording], points, labels)
-
-
 def loops_from_pieces(
     pieces: Iterable[Recording], points: int = 300, labels: Collection[str] = ()
 ) -> tuple[SteadyLoop, ...]:

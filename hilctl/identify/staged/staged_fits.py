@@ -193,7 +193,7 @@ def find_staged(job: FitJob, data: FitData, layers: Layers) -> StagedEnd:
     ranked = ranked[: settings.starts]
     progress(0.2, f"following {len(ranked)} starts")
     tasks = [StagedTask(few, layers, point, few_scale, ROUNDS) for _, point in ranked]
-    ends = job.run(descended, tasks)
+    ends = list(job.run(descended, tasks))
     outcomes = [
         _outcome(i, task, end) for i, (task, end) in enumerate(zip(tasks, ends, strict=True))
     ]

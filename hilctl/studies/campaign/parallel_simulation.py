@@ -15,7 +15,7 @@ from hilctl.base.files import TextFiles, write_file
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
-from hilctl.identify.parallel import streams
+from hilctl.identify.parallel import workers
 from hilctl.recording.reader import read
 from hilctl.run.unpaced import run_unpaced
 from hilctl.studies.campaign.campaign_runner import (
@@ -84,15 +84,15 @@ def run_fast(plan: CampaignPlan, host: CampaignHost, scheduler: str = "none") ->
     """Run the remaining steps as fast as possible; raise InputError if the disk has no space."""
     plan.require_room()
     left = plan.left
-    with streams(scheduler) as stream:
+    with workers(scheduler) as run:
         state = Campaign(plan, host)
         state.keep()
-        runs = stream(run_task, [_task(each) for each in left])
-        for number, (each, run) in enumerate(zip(left, runs, strict=True), 1):
-            _take(state, each, run)
+        runs = run(run_task, [_task(each) for each in left])
+        for number, (each, fast) in enumerate(zip(left, runs, strict=True), 1):
+            _take(state, each, fast)
             host.on_progress(number / len(left), f"{len(left) - number} of {len(left)} runs left")
-            if not run.harmless:
-                return state.result(f"{each.step.text}: {run.reason}")
+            if not fast.harmless:
+                return state.result(f"{each.step.text}: {fast.reason}")
     return state.result()
 
 

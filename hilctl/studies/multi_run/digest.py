@@ -19,7 +19,7 @@ from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
-from hilctl.identify.data.cycles import loops_from_recording
+from hilctl.identify.data.cycles import loops_from_pieces
 from hilctl.identify.evaluation import judge
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import parse_model
@@ -298,7 +298,7 @@ def _modelled(
         known = model or parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
         if known.input_unit != recording.command_unit:
             return {}
-        loop = loops_from_recording(recording, POINTS, [segment.label])[-1]
+        loop = loops_from_pieces([recording], POINTS, [segment.label])[-1]
         found = judge(known, [loop])
     except (DataError, ConfigError, ModelError):  # no cycle, or an unreadable model
         return {}

@@ -37,7 +37,10 @@ def test_a_model_is_identified_and_written(table, tmp_path):
 def test_arguments_are_passed_on(monkeypatch):
     seen = {}
     monkeypatch.setattr("hilctl.api.models.refine_files", lambda *given, **named: (given, named))
-    monkeypatch.setattr("hilctl.comparison.compare.compare", lambda *given: seen.update(all=given))
+    monkeypatch.setattr(
+        "hilctl.comparison.compare.compare",
+        lambda paths, models, **named: seen.update(named, paths=paths, models=models),
+    )
     given, named = api.refine("m.yaml", ["a.mcap", "b.mcap"], validate="c.mcap", overwrite=True)
     assert [str(path) for path in (given[0], *given[1], *given[3])] == [
         "m.yaml", "a.mcap", "b.mcap", "c.mcap",
@@ -45,9 +48,8 @@ def test_arguments_are_passed_on(monkeypatch):
     assert given[2] is None
     assert named["overwrite"]
     api.compare("a.mcap", ["ppi"], settings={"block": 5}, frequencies_hz=[1.0])
-    request = seen["all"][0]
-    assert [str(path) for path in request.recordings] == ["a.mcap"]
-    assert (request.models, request.settings, request.points) == (["ppi"], ["block=5"], 300)
+    assert [str(path) for path in seen["paths"]] == ["a.mcap"]
+    assert (seen["models"], seen["settings"], seen["points"]) == (["ppi"], ["block=5"], 300)
 
 
 @pytest.mark.parametrize(

@@ -10,7 +10,7 @@ from hilctl.base.errors import ConfigError
 from hilctl.cli import campaigns
 from hilctl.cli.campaigns import print_campaign, print_row, sweep_document
 from hilctl.experiment.correction import Correction, LearnedCycle
-from hilctl.ilc.results import IlcResult, IlcRow
+from hilctl.ilc.ilc_session import IlcResult, IlcRow
 from hilctl.studies.campaign.campaign_runner import CampaignResult
 from hilctl.studies.campaign.plan import planned
 from hilctl.studies.campaign.steps import CampaignStep, load_campaign

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.cli.models import _numbers, column_of, headings, notes, render_comparison, table_rows
-from hilctl.comparison.compare import ComparisonRequest, compare
+from hilctl.comparison.compare import compare
 from hilctl.experiment.examples import examples_folder
 from hilctl.identify.settings import IdentifySettings
 from hilctl.models.model_file import dump_model, load_model
@@ -67,8 +67,8 @@ OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
 @pytest.fixture(scope="module")
 def comparison():
     """Two models of the catalogue and one of a file, tested at 100 Hz."""
-    request = ComparisonRequest([GOLDEN], ["spi", "straight", str(OMEGA)], frequencies_hz=[100.0])
-    return compare(request, SteppingClock(1e-3), lambda done, text: None)
+    models = ["spi", "straight", str(OMEGA)]
+    return compare([GOLDEN], models, frequencies_hz=[100.0], clock=SteppingClock(1e-3))
 
 
 def test_table_has_a_column_per_trial(comparison):

@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.comparison.compare import ComparisonRequest, compare
+from hilctl.comparison.compare import compare
 from hilctl.identify.fit_api import ignore_progress
 from tests.fakes import SteppingClock
 
@@ -14,7 +14,7 @@ OMEGA = ROOT / "configs" / "models" / "terfenol_omega.yaml"
 
 
 def compared(path=GOLDEN, models=("straight",), progress=ignore_progress, **options):
-    return compare(ComparisonRequest([path], models, **options), SteppingClock(1e-3), progress)
+    return compare([path], models, clock=SteppingClock(1e-3), progress=progress, **options)
 
 
 @pytest.fixture(scope="package")

@@ -89,7 +89,8 @@ def test_a_model_of_another_unit_is_refused():
 
 
 def test_saved_models_are_model_files(comparison, tmp_path):
-    paths = save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
+    save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
+    paths = sorted((tmp_path / "models").iterdir())
     assert [path.name for path in paths] == ["duhem.yaml", "straight.yaml"]
     for path, row in zip(paths, comparison.rows, strict=False):
         saved = load_model(path)

@@ -13,4 +13,4 @@ def test_the_least_slope_is_a_part_of_the_data_s_gain(data_of):
     job = FitJob(data, FitSettings(kind="ppi"))
     assert data.gain == pytest.approx(4.0, rel=1e-3)
     assert job.least == pytest.approx(4.0 * LEAST_SLOPE, rel=1e-3)
-    assert job.run(abs, [-1, 2]) == [1, 2]
+    assert list(job.run(abs, [-1, 2])) == [1, 2]

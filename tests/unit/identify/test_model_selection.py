@@ -21,7 +21,6 @@ from hilctl.identify.model_selection import (
     folds_of,
     select,
 )
-from hilctl.identify.parallel import serial_map
 from hilctl.identify.pipeline import settings_from
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PpiModel
@@ -192,7 +191,7 @@ def test_a_kind_is_selected_on_small_motions_as_well(monkeypatch):
     judge = model_selection.held_out_errors
 
     def with_small_motions(requests, run):
-        found = judge(requests, run)
+        found = list(judge(requests, run))
         for request, each in zip(requests, found, strict=True):
             small = 0.2 if request.settings.kind == "generalised_duhem" else 2.0
             errors = (*each.judgement.classes, StrokeError("tenth stroke", small, small, 9))
@@ -287,7 +286,7 @@ def test_lag_of_a_table_is_found():
         return [History("stage", command, late, 200.0, ignore=10).without_lag(lag)]
 
     settings = FitSettings(kind="ppi", weights="free", offset=True)
-    assert choose_lag(load, settings, serial_map, ignore_progress) == 3
+    assert choose_lag(load, settings, map, ignore_progress) == 3
 
 
 def test_creep_and_zero_of_each_history_are_taken_out():

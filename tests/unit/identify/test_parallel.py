@@ -51,7 +51,7 @@ def test_fits_that_nobody_waits_for_end():
 
     def run() -> None:
         with workers("threads") as each:
-            each(fit, [1, 0])
+            list(each(fit, [1, 0]))
 
     with pytest.raises(KeyboardInterrupt):
         run()

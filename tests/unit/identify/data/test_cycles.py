@@ -12,7 +12,6 @@ from hilctl.identify.data.cycles import (
     find_cycles,
     find_period,
     loops_from_pieces,
-    loops_from_recording,
     steady_stretch,
 )
 from hilctl.identify.data.records import History
@@ -33,7 +32,7 @@ def sine_segment(frequency_hz: float, cycles: int, start: int = 0) -> tuple[np.n
 def test_loops_keep_the_waveform_at_any_period(frequency_hz, recording_of):
     """300 points come out right whether a cycle has 5000, 333.3, 200 or 287.9 samples."""
     command, segment = sine_segment(frequency_hz, 8)
-    (loop,) = loops_from_recording(recording_of(command, -5.0 * command, [segment]))
+    (loop,) = loops_from_pieces([recording_of(command, -5.0 * command, [segment])])
     first = segment.steady_cycles()[0]
     turn = 2.0 * np.pi * (np.arange(300) / 300 + first / segment.period)
     np.testing.assert_allclose(loop.command, 6.0 * np.sin(turn), atol=6e-4)
@@ -47,7 +46,7 @@ def test_averaging_takes_noise_out(recording_of):
     """Noise falls with the root of the samples in a bin: 19 cycles x 16.7 samples a point here."""
     command, segment = sine_segment(10.0, 20)
     noise = np.random.default_rng(5).normal(0.0, 1.0, command.size)
-    (loop,) = loops_from_recording(recording_of(command, command + noise, [segment]))
+    (loop,) = loops_from_pieces([recording_of(command, command + noise, [segment])])
     left = loop.displacement_um - loop.command
     assert np.std(left) == pytest.approx(1.0 / np.sqrt(19 * 5000 / 300), rel=0.2)
 
@@ -56,7 +55,7 @@ def test_samples_missing_from_some_cycles_do_no_harm(recording_of):
     command, segment = sine_segment(100.0, 6)
     kept = np.flatnonzero((np.arange(command.size) < 900) | (np.arange(command.size) > 1100))
     recording = recording_of(command[kept], command[kept], [segment], index=kept)
-    (loop,) = loops_from_recording(recording)
+    (loop,) = loops_from_pieces([recording])
     start = segment.steady_cycles()[0] / segment.period
     expected = 6.0 * np.sin(2.0 * np.pi * (np.arange(300) / 300 + start))
     np.testing.assert_allclose(loop.command, expected, atol=1e-3)
@@ -72,7 +71,7 @@ def test_loops_in_pieces_are_those_of_the_whole(recording_of):
     recording = recording_of(command, command + noise, [segment, later])
     cuts = (slice(0, 10), slice(10, 2222), slice(2222, 2222), slice(2222, 4001), slice(4001, None))
     pieces = [replace(recording, samples=recording.samples.rows(cut)) for cut in cuts]
-    for loop, whole in zip(loops_from_pieces(pieces), loops_from_recording(recording), strict=True):
+    for loop, whole in zip(loops_from_pieces(pieces), loops_from_pieces([recording]), strict=True):
         assert (loop.label, loop.frequency_hz) == (whole.label, whole.frequency_hz)
         np.testing.assert_allclose(loop.command, whole.command, rtol=0, atol=1e-12)
         np.testing.assert_allclose(loop.displacement_um, whole.displacement_um, atol=1e-12)
@@ -100,17 +99,17 @@ def test_a_segment_without_steady_cycle_is_named(recording_of):
     short = Segment("step 1 A", 0, 5000, 0, 5000, 0.0)
     recording = recording_of(command, command, [segment, short])
     with pytest.raises(DataError, match=r"'step 1 A'"):
-        loops_from_recording(recording)
-    assert len(loops_from_recording(recording, labels=[segment.label])) == 1
+        loops_from_pieces([recording])
+    assert len(loops_from_pieces([recording], labels=[segment.label])) == 1
 
 
 def test_unknown_labels_are_refused_with_the_known_ones(recording_of):
     command, segment = sine_segment(10.0, 2)
     recording = recording_of(command, command, [segment])
     with pytest.raises(DataError, match=r"'sine 7 A'.*'sine 6 A 10 Hz'"):
-        loops_from_recording(recording, labels=["sine 7 A"])
+        loops_from_pieces([recording], labels=["sine 7 A"])
     with pytest.raises(DataError, match="it has none"):
-        loops_from_recording(recording_of(command, command, []))
+        loops_from_pieces([recording_of(command, command, [])])
 
 
 def test_find_cycles_skips_rest_and_decay():
