@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -26,7 +25,6 @@ from hilctl.studies.calibrate import (
     write_calibration,
 )
 from hilctl.studies.campaign.campaign_runner import (
-    CampaignHost,
     CampaignResult,
     planned_in_real_time,
     prepared,
@@ -38,7 +36,6 @@ from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, load_camp
 from hilctl.studies.campaign.store import campaign_folder
 from hilctl.studies.campaign.table import CampaignRow
 from hilctl.studies.characterise.characterisation_runner import (
-    CharacterisationHost,
     CharacterisationPlan,
     CharacterisationRunner,
 )
@@ -164,9 +161,7 @@ def characterise(
     page = file.with_suffix(".html")
     if page == file:
         raise InputError(f"{file}: is the name of the page: choose another --output, such as .yaml")
-    host = CharacterisationHost(
-        run=unpaced if fast else paced, on_progress=on_progress, on_step=on_step
-    )
+    host = StudyHost(run=unpaced if fast else paced, on_progress=on_progress, on_step=on_step)
     measured = CharacterisationRunner(
         Path(experiment), texts_of(settings), chosen, highest_hz, host
     )
@@ -222,7 +217,7 @@ def campaign(
         InputError: An input is invalid; nothing has moved.
         RunError: A hazard to device or rig ended the campaign; completed steps are kept.
     """
-    host = replace(CampaignHost(), on_progress=on_progress, on_row=on_row, on_note=on_note)
+    host = StudyHost(on_progress=on_progress, on_step=on_row, on_note=on_note)
     steps = load_campaign(Path(file), texts_of(settings))
     return run_steps(
         steps, path_or_none(folder), host,
@@ -272,7 +267,7 @@ def learn(
 def run_steps(
     steps: CampaignSteps,
     folder: Path | None,
-    host: CampaignHost,
+    host: StudyHost,
     *,
     fast: bool,
     scheduler: str,

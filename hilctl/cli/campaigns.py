@@ -33,7 +33,7 @@ from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.sections import label_settings
 from hilctl.ilc.ilc_session import IlcResult, IlcRow, correction_setting
 from hilctl.run.control.client import finish_dead_runs
-from hilctl.studies.campaign.campaign_runner import CampaignHost, CampaignResult
+from hilctl.studies.campaign.campaign_runner import CampaignResult
 from hilctl.studies.campaign.plan import CampaignPlan
 from hilctl.studies.campaign.steps import (
     CampaignStep,
@@ -50,6 +50,7 @@ from hilctl.studies.multi_run.varied_parameter import (
     short_value,
     texts_of,
 )
+from hilctl.studies.step_runner import StudyHost
 
 _RESUMES = "the same command resumes from there"
 Folder = Annotated[
@@ -141,8 +142,8 @@ def _run_campaign(
             print_json(plan_mapping(plan))
 
     with progress_bar("campaign", quiet=as_json) as on_progress:
-        host = CampaignHost(on_progress=on_progress, on_note=_note)
-        host = host if as_json else replace(host, on_row=partial(print_row, varied))
+        host = StudyHost(on_progress=on_progress, on_note=_note)
+        host = host if as_json else replace(host, on_step=partial(print_row, varied))
         try:
             result = run_steps(
                 steps, folder, host,

@@ -24,12 +24,20 @@ _WAIT_SHOWN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class StudyHost:
-    """Runs, time and observers of a study; progress is from 0 to 1, with a description."""
+    """Runs, time and observers of a study.
+
+    Attributes:
+        on_progress: Called with the part that is done, 0 to 1, and a description.
+        on_step: Called with the result of each step.
+        on_note: Called with a note on each repaired recording.
+    """
 
     run: Callable[..., RunResult] = paced
     now_s: Callable[[], float] = time.time
     sleep_s: Callable[[float], None] = time.sleep
     on_progress: Callable[[float, str], None] = field(default=lambda done, text: None)
+    on_step: Callable[..., None] = field(default=lambda *result: None)
+    on_note: Callable[[str], None] = field(default=lambda text: None)
 
 
 class StepRunner:

@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from hilctl.recording.reader import read
-from hilctl.studies.campaign.campaign_runner import CampaignHost
+from hilctl.studies.campaign.campaign_runner import StudyHost
 from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
 from hilctl.studies.campaign.steps import load_campaign
 from hilctl.studies.multi_run import trend
@@ -62,7 +62,7 @@ def ran(tmp_path_factory):
         if name not in tables:
             folder = tmp_path_factory.mktemp(name)
             plan = planned_fast(load_campaign(CAMPAIGNS / f"{name}.yaml"), folder)
-            result = run_fast(plan, CampaignHost(), "processes")
+            result = run_fast(plan, StudyHost(), "processes")
             assert result.count("completed") == len(plan.steps), result.reason
             tables[name] = (Table(result.tables[0]), result)
         return tables[name]

@@ -16,9 +16,9 @@ from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, unpaced
 from hilctl.run.unpaced import run_unpaced
 from hilctl.studies.characterise.characterisation_runner import (
-    CharacterisationHost,
     CharacterisationRunner,
 )
+from hilctl.studies.step_runner import StudyHost
 from tests.commands import hilctl
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -26,9 +26,7 @@ RIG = CONFIGS / "terfenol_sine_6a.yaml"
 
 
 def characterised(path, settings, folder, output):
-    campaign = CharacterisationRunner(
-        path, settings, folder, None, CharacterisationHost(run=unpaced)
-    )
+    campaign = CharacterisationRunner(path, settings, folder, None, StudyHost(run=unpaced))
     assert campaign.plan.seconds < 300.0
     return campaign.characterise(output)
 
@@ -75,11 +73,11 @@ def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
 def test_what_is_wrong_with_a_rig_is_named(tmp_path, setting, code):
     quick = ["sample_rate_hz=20000", "block=20"]
     campaign = CharacterisationRunner(
-        RIG, [*quick, setting], tmp_path, None, CharacterisationHost(run=unpaced)
+        RIG, [*quick, setting], tmp_path, None, StudyHost(run=unpaced)
     )
     if not code:  # a weak one, but nothing is wrong with it
         campaign = CharacterisationRunner(
-            RIG, [*quick, setting], tmp_path, 40.0, CharacterisationHost(run=unpaced)
+            RIG, [*quick, setting], tmp_path, 40.0, StudyHost(run=unpaced)
         )
     found = campaign.characterise(tmp_path / "model.yaml")
     assert found.problem_code == code

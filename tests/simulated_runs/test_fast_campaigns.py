@@ -1,7 +1,7 @@
 """Campaigns without real time over several processes: the same as in one."""
 
 from hilctl.recording.reader import read
-from hilctl.studies.campaign.campaign_runner import CampaignHost
+from hilctl.studies.campaign.campaign_runner import StudyHost
 from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
 from hilctl.studies.campaign.steps import load_campaign
 from tests.unit.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
@@ -20,7 +20,7 @@ def test_processes_give_the_table_of_one(tmp_path, monkeypatch):
     for scheduler in ("none", "processes"):
         folder = tmp_path / scheduler
         folder.mkdir()
-        result = run_fast(planned_fast(few, folder), CampaignHost(), scheduler)
+        result = run_fast(planned_fast(few, folder), StudyHost(), scheduler)
         assert result.count("completed") == 4
         samples = [read(path).samples for path in sorted(folder.glob("*.mcap"))]
         measured = [each.displacement_um.tobytes() for each in samples]

@@ -1,8 +1,8 @@
 """Campaign runner: completed steps are kept, failed ones marked; a fault of the rig ends it."""
 
-from collections.abc import Callable, Iterator
+from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
@@ -35,15 +35,6 @@ HARMLESS = frozenset({"late", "dropped", "invalid_command"})
 
 _FIRST_PAGE_S = 60.0
 _PAGE_SHARE = 30.0  # pause before the page is written again, over the time to write it
-
-
-@dataclass(frozen=True, slots=True)
-class CampaignHost(StudyHost):
-    """Runs, time and observers of a campaign."""
-
-    # called after each step
-    on_row: Callable[[CampaignStep, CampaignRow], None] = field(default=lambda step, row: None)
-    on_note: Callable[[str], None] = field(default=lambda text: None)  # per repaired file
 
 
 @shown_briefly
@@ -89,7 +80,7 @@ class Campaign:
     and between steps while that takes a small part of the time.
     """
 
-    def __init__(self, plan: CampaignPlan, host: CampaignHost) -> None:
+    def __init__(self, plan: CampaignPlan, host: StudyHost) -> None:
         self.plan = plan
         self.rows: dict[int, CampaignRow] = {}
         self.tables: list[Path] = []
@@ -111,7 +102,7 @@ class Campaign:
             self.tables = write_table(self.plan, self.rows)
             if self._host.now_s() >= self._next_page_s:
                 self._write_page()
-        self._host.on_row(each.step, row)
+        self._host.on_step(each.step, row)
 
     def result(self, reason: str = "", stop_signal: int = 0) -> CampaignResult:
         """Return the result so far, and write its page."""
@@ -140,7 +131,7 @@ def measured(recording: Recording) -> CampaignRow:
 
 
 @contextmanager
-def prepared(folder: Path, host: CampaignHost) -> Iterator[None]:
+def prepared(folder: Path, host: StudyHost) -> Iterator[None]:
     """Lock a campaign's folder, unless another writes to it, and repair recordings."""
     with locked_folder(folder, host.sleep_s):
         await_runs(folder, host.sleep_s)
@@ -172,7 +163,7 @@ def _heat_a2(each: PlannedStep, last: Path | None, now_s: float) -> float:
     return max(heat_a2, heat_after(last, config, now_s))
 
 
-def run_series(plan: CampaignPlan, host: CampaignHost) -> CampaignResult:
+def run_series(plan: CampaignPlan, host: StudyHost) -> CampaignResult:
     """Run the remaining steps of a campaign one after the other in real time.
 
     Raises:
@@ -198,7 +189,7 @@ def run_series(plan: CampaignPlan, host: CampaignHost) -> CampaignResult:
 class _Steps:
     """Steps of a campaign in real time."""
 
-    def __init__(self, state: Campaign, host: CampaignHost) -> None:
+    def __init__(self, state: Campaign, host: StudyHost) -> None:
         self._state, self._host, self._plan = state, host, state.plan
         self._last = last_started(self._plan.folder)
         self._runner = StepRunner(host, self._plan.seconds + self._plan.pauses_s)

@@ -20,7 +20,6 @@ from hilctl.recording.reader import read
 from hilctl.run.unpaced import run_unpaced
 from hilctl.studies.campaign.campaign_runner import (
     Campaign,
-    CampaignHost,
     CampaignResult,
     is_harmless,
 )
@@ -30,6 +29,7 @@ from hilctl.studies.campaign.store import completed_runs, new_recording
 from hilctl.studies.campaign.table import CampaignRow
 from hilctl.studies.multi_run.collect import COMPLETED
 from hilctl.studies.multi_run.digest import RunDigest, RunFigures, digest_of
+from hilctl.studies.step_runner import StudyHost
 
 
 @dataclass(frozen=True, slots=True)
@@ -80,7 +80,7 @@ def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
     return plan
 
 
-def run_fast(plan: CampaignPlan, host: CampaignHost, scheduler: str = "none") -> CampaignResult:
+def run_fast(plan: CampaignPlan, host: StudyHost, scheduler: str = "none") -> CampaignResult:
     """Run the remaining steps as fast as possible; raise InputError if the disk has no space."""
     plan.require_room()
     left = plan.left

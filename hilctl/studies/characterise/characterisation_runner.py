@@ -1,9 +1,9 @@
 """Characterisation runner: one run per step, each planned from the steps before it."""
 
 import json
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
-from dataclasses import dataclass, field, replace
+from dataclasses import dataclass, replace
 from functools import cached_property
 from pathlib import Path
 
@@ -93,13 +93,6 @@ class CharacterisationPlan:
         return sum(step.megabytes for step in self.steps)
 
 
-@dataclass(frozen=True, slots=True)
-class CharacterisationHost(StudyHost):
-    """Runs, time and observers of a characterisation."""
-
-    on_step: Callable[[StepRow], None] = field(default=lambda row: None)  # after each step
-
-
 class CharacterisationRunner:
     """Characterise the device of an experiment; its waveform and compensator are not used.
 
@@ -113,13 +106,13 @@ class CharacterisationRunner:
         settings: Sequence[str],
         folder: Path,
         highest_hz: float | None = None,  # of loops; derived from the sample rate if None
-        host: CharacterisationHost | None = None,
+        host: StudyHost | None = None,
     ) -> None:
         self._experiment = experiment
         self._given = settings
         self._settings = [*settings, *without_reference(experiment, settings)]
         self._folder = folder
-        self._host = host or CharacterisationHost()
+        self._host = host or StudyHost()
         first = {"kind": "hold", "unit": unit_of(experiment, self._settings), "level": 0.0}
         hold = setting("waveform", {**first, "duration_s": 1.0})
         self._loaded = load_experiment(experiment, [*self._settings, hold])

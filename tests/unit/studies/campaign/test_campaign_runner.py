@@ -12,11 +12,11 @@ from hilctl.recording.reader import read
 from hilctl.run.start import completed_key
 from hilctl.studies.campaign import campaign_runner
 from hilctl.studies.campaign.campaign_runner import (
-    CampaignHost,
     is_harmless,
     planned_in_real_time,
     run_series,
 )
+from hilctl.studies.step_runner import StudyHost
 from tests.unit.studies.campaign.conftest import CAMPAIGN
 from tests.unit.studies.conftest import StudyRig
 
@@ -28,9 +28,9 @@ class Rig(StudyRig):
 
     @property
     def host(self):
-        return CampaignHost(
+        return StudyHost(
             **self.observers,
-            on_row=lambda step, row: self.rows.append((step.number, row.code, row.kept)),
+            on_step=lambda step, row: self.rows.append((step.number, row.code, row.kept)),
         )
 
 

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.recording.reader import read
-from hilctl.studies.campaign.campaign_runner import CampaignHost
+from hilctl.studies.campaign.campaign_runner import StudyHost
 from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
 from hilctl.studies.campaign.plan import CampaignPlan
 from tests.unit.studies.campaign.conftest import CAMPAIGN
@@ -24,7 +24,7 @@ def test_a_campaign_resumes(campaign, tmp_path):
     folder = tmp_path / "runs"
     folder.mkdir()
     rows = []
-    host = CampaignHost(on_row=lambda step, row: rows.append((step.number, row.kept)))
+    host = StudyHost(on_step=lambda step, row: rows.append((step.number, row.kept)))
     first = run_fast(planned_fast(few, folder), host)
     assert first.count("completed") == 4
     whole = tables(first)
@@ -45,11 +45,11 @@ def test_a_dask_cluster_gives_the_same_table(campaign, tmp_path):
     alone, shared = tmp_path / "alone", tmp_path / "shared"
     for folder in (alone, shared):
         folder.mkdir()
-    one = run_fast(planned_fast(few, alone), CampaignHost())
+    one = run_fast(planned_fast(few, alone), StudyHost())
     with LocalCluster(
         n_workers=1, threads_per_worker=1, processes=False, protocol="tcp", dashboard_address=None
     ) as cluster:
-        other = run_fast(planned_fast(few, shared), CampaignHost(), cluster.scheduler_address)
+        other = run_fast(planned_fast(few, shared), StudyHost(), cluster.scheduler_address)
     assert tables(other)[0] == tables(one)[0]
     for path in alone.glob("*.mcap"):
         mine, theirs = read(path).samples, read(shared / path.name).samples
@@ -58,7 +58,7 @@ def test_a_dask_cluster_gives_the_same_table(campaign, tmp_path):
 
 def test_a_fault_of_the_rig_ends_it(campaign, tmp_path):
     text = CAMPAIGN + "  device.fault: [null, {kind: sensor_nan, at_sample: 100}]\n"
-    result = run_fast(planned_fast(campaign(text), tmp_path), CampaignHost())
+    result = run_fast(planned_fast(campaign(text), tmp_path), StudyHost())
     assert [row.code for _, row in result.ordered][:3] == ["completed", "fault", "planned"]
     assert "displacement nan µm" in result.reason
     assert read(tmp_path / result.rows[2].recording).end["code"] == "fault"

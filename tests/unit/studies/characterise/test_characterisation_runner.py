@@ -11,14 +11,13 @@ from hilctl.experiment.load import load_experiment
 from hilctl.run.start import StepStoppedError, unpaced
 from hilctl.studies.characterise import characterisation_runner
 from hilctl.studies.characterise.characterisation_runner import (
-    CharacterisationHost,
     CharacterisationRunner,
     unit_of,
     without_reference,
 )
 from hilctl.studies.characterise.steps import STEPS
 from hilctl.studies.characterise.waveforms import biased_loops
-from hilctl.studies.step_runner import setting
+from hilctl.studies.step_runner import StudyHost, setting
 from tests.unit.studies.conftest import StudyRig
 
 FEW = ("rest", "polarity", "growing-1", "growing-2")
@@ -27,7 +26,7 @@ SHORT = tuple(step for step in STEPS if step.name.startswith(FEW))
 
 class Rig(StudyRig):
     def host(self):
-        return CharacterisationHost(**self.observers, on_step=self.rows.append)
+        return StudyHost(**self.observers, on_step=self.rows.append)
 
 
 @pytest.fixture(autouse=True)
@@ -192,7 +191,7 @@ def test_a_real_device_keeps_real_time(experiment, monkeypatch):
         SimulatedTerfenol, "info", property(lambda self: replace(info.fget(self), simulated=False))
     )
     with pytest.raises(InputError, match="--fast: simulated_terfenol"):
-        runner_of(experiment, CharacterisationHost(run=unpaced))
+        runner_of(experiment, StudyHost(run=unpaced))
 
 
 def test_a_broken_experiment_is_refused_at_once(experiment):
