@@ -192,7 +192,6 @@ LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated
 """Candidates for steady loops."""
 ORDERS = ((6, 4), (8, 6), (12, 8), (16, 10), (20, 12), (28, 16))
 """Plays, and deadbands on each side if the model has any."""
-LINES = (8, 12, 16, 20, 28, 36)  # lines of a Preisach triangle, instead of :data:`ORDERS`
 WORTH_SIZE = 1.03  # a larger model must lower the error by more than 3 %
 MOST_LAG = 8  # samples tried
 
@@ -209,7 +208,7 @@ class CandidateScore:
 
 @dataclass(frozen=True, slots=True)
 class OrderScore:
-    """Errors of one size on held-out data, of the stroke; ``plays`` may count lines."""
+    """Errors of one size on held-out data, of the stroke."""
 
     plays: int
     deadbands_a_side: int
@@ -287,10 +286,7 @@ def _activation(tried: "_Tried") -> dict[str, Any]:
 def _choose_order(request: FitRequest) -> Selection:
     """Return the smallest size whose error is near the least."""
     settings = request.settings
-    if settings.hysteresis == "preisach":
-        sizes = [settings.model_copy(update={"lines": lines}) for lines in LINES]
-    else:
-        sizes = [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
+    sizes = [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
     request.progress(0.0, f"fits of {len(sizes)} sizes with held-out data")
     errors = _tried(request, [("", size) for size in sizes])
     if not errors:
@@ -323,8 +319,6 @@ class _Tried:
     def order(self) -> OrderScore:
         settings = self.settings
         plays, deadbands = settings.plays, settings.deadbands if settings.has("deadbands") else 0
-        if settings.hysteresis == "preisach":
-            plays, deadbands = settings.lines, 0
         return OrderScore(plays, deadbands, self.rms_percent, self.held_out.judgement.peak_percent)
 
 

@@ -70,7 +70,7 @@ class FitSettings(StrictModel):
     lines: int = _of(
         ("staged", "preisach"),
         28,
-        "Lines of a Preisach triangle, and cells of the longest line; or auto.",
+        "Lines of a Preisach triangle, and cells of the longest line.",
         ge=2,
         le=100,
     )
@@ -126,10 +126,10 @@ class FitSettings(StrictModel):
         """Fill in the defaults of the kind; ``auto`` for a number of operators sets the size."""
         if not isinstance(given, dict):
             return given
-        sized = [name for name in ("plays", "lines") if given.get(name) == "auto"]
+        sized = given.get("plays") == "auto"
         if sized and "deadbands" in given:
-            raise ValueError(f"{sized[0]}=auto selects the number of deadbands too: omit deadbands")
-        kept = {name: value for name, value in given.items() if name not in sized}
+            raise ValueError("plays=auto selects the number of deadbands too: omit deadbands")
+        kept = {name: value for name, value in given.items() if name != "plays" or not sized}
         kind = kept.get("kind", "integrated")
         published = PUBLISHED.get(kind, {}) if isinstance(kind, str) else {}
         return {**published, **({"size": "auto"} if sized else {}), **kept}

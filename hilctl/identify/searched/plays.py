@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, Protocol
+from typing import Any, TypeAlias
 
 import numpy as np
 from scipy.linalg import qr
@@ -52,27 +52,8 @@ class SearchSpace:
         return np.where((drawn > self.low) & (drawn < self.high), drawn, inside)
 
 
-class SearchProblem(Protocol):
-    """A family of models; ``held`` counts the rows of a smoothness prior after the samples."""
-
-    space: SearchSpace
-    held: int
-
-    def error_um(self, x: F64, scale: F64) -> F64:
-        """Return the errors of samples and prior, float64[N]; weights depend on ``scale``."""
-
-    def slopes_um(self, x: F64, scale: F64) -> F64:
-        """Return the derivatives of the error: float64[N, p]."""
-
-    def build(self, x: F64, scale: F64) -> PlayModel:
-        """Return the model at a point of the space."""
-
-    def parameters(self, x: F64, scale: F64) -> dict[str, float]:
-        """Return the parameters at a point under their published names."""
-
-
 def search(
-    problem: SearchProblem,
+    problem: "SearchProblem",
     scale: F64,
     stroke_um: float,
     starts: int,
@@ -105,7 +86,7 @@ def search(
     return best, tuple(outcomes)
 
 
-def polished(problem: SearchProblem, x: F64, scale: F64, evaluations: int) -> tuple[F64, int]:
+def polished(problem: "SearchProblem", x: F64, scale: F64, evaluations: int) -> tuple[F64, int]:
     """Return the end of bounded least squares from ``x``, and the evaluations."""
     space = problem.space
 
@@ -118,7 +99,7 @@ def polished(problem: SearchProblem, x: F64, scale: F64, evaluations: int) -> tu
     return converged(residuals, x, space.low, space.high, evaluations, slopes)
 
 
-def searched_fit(problem: SearchProblem, job: FitJob) -> FoundModel:
+def searched_fit(problem: "SearchProblem", job: FitJob) -> FoundModel:
     """Return the model that solves a problem."""
     data, settings = job.data, job.settings
     rng = np.random.default_rng(SEED)
@@ -190,7 +171,7 @@ class PlaysProblem:
         self._target = np.append(data.target_um, np.zeros(self.held))
 
     def error_um(self, x: F64, scale: F64) -> F64:
-        """Return modelled minus measured displacement, see :class:`SearchProblem`."""
+        """Return modelled minus measured displacement, see :data:`SearchProblem`."""
         columns = self._columns(x)
         weights, free = self._solve(columns, scale)
         beside = self._free @ free
@@ -330,7 +311,7 @@ class ExponentialProblem:
         self.space = SearchSpace.of(space)
 
     def error_um(self, x: F64, scale: F64) -> F64:
-        """Return modelled minus measured displacement, see :class:`SearchProblem`."""
+        """Return modelled minus measured displacement, see :data:`SearchProblem`."""
         known, data = self.parameters(x, scale), self._data
         thresholds = known["alpha"] * self._numbers
         inner = data.play_sum(known["a_0"], thresholds, self._play_weights(x), known["gamma"])
@@ -424,6 +405,12 @@ class ExponentialProblem:
         """Return the share of each deadband in the change of slope of a side: float64[k]."""
         rates = exponential_weights(1.0, float(x[1]) / self._steps.size, self._steps.size)
         return np.asarray(rates / rates.sum())
+
+
+SearchProblem: TypeAlias = PlaysProblem | ExponentialProblem
+"""A family of models, as a sum of squares. ``held`` counts the rows of a smoothness prior after the
+samples; errors float64[N] include these, and weights that follow from a point depend on ``scale``.
+"""
 
 
 def fit_exponential(job: FitJob) -> FoundModel:
