@@ -5,17 +5,15 @@ from dataclasses import dataclass, field, fields
 from typing import Any
 
 import numpy as np
-from pydantic import TypeAdapter, ValidationError
 
 from hilctl.analysis.plot_style import min_max
 from hilctl.analysis.report import summarize, worst_segment
 from hilctl.analysis.response.frequency_response import FrequencyResponse, frequency_response
-from hilctl.analysis.response.step_response import Ringing, ringing
+from hilctl.analysis.response.step_response import StepResponse, step_response
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.steady_state import steady_part
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError
 from hilctl.base.events import OFFSET
-from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
@@ -26,7 +24,6 @@ from hilctl.models.model_file import parse_model
 from hilctl.recording.metadata_keys import HEAT_FACT, LabelValue
 from hilctl.recording.recording import Recording
 from hilctl.studies.multi_run.minor_loops import minor_loops
-from hilctl.waveforms.spec import AnyWaveform, Multisine, Step
 
 
 @dataclass(frozen=True, slots=True)
@@ -83,7 +80,7 @@ def _figures(
     recording: Recording,
     report: RunReport,
     worst: Segment | None,
-    structure: FrequencyResponse | Ringing | None,
+    structure: FrequencyResponse | StepResponse | None,
 ) -> RunFigures:
     measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
     return RunFigures(
@@ -133,28 +130,15 @@ def _minor(loop_input: F64, output: F64) -> dict[str, float]:
     return found
 
 
-def _structure(recording: Recording, waveform: Any) -> FrequencyResponse | Ringing | None:
-    """Return natural frequency and damping, if the waveform is a multisine or a step."""
-    if isinstance(waveform, Multisine):
-        try:
+def _structure(recording: Recording) -> FrequencyResponse | StepResponse | None:
+    """Return the response with natural frequency and damping, of a multisine or a step only."""
+    kinds = {segment.kind for segment in recording.segments}
+    try:
+        if kinds == {"multisine"}:
             return frequency_response(recording)
-        except DataError:  # below the noise
-            return None
-    if not isinstance(waveform, Step):
+        return step_response(recording) if kinds == {"step"} else None
+    except DataError:  # below the noise, or without a displacement
         return None
-    moved_um = _after_step(recording, waveform).displacement_um
-    whole = moved_um.size and np.isfinite(moved_um).all()
-    return ringing(moved_um, recording.sample_rate_hz) if whole else None
-
-
-def _after_step(recording: Recording, waveform: Step) -> Samples:
-    """Return the samples from the end of the largest step to the next step."""
-    segment, rate_hz = recording.segments[0], recording.sample_rate_hz
-    levels = np.array([0.0, *waveform.levels])
-    largest = int(np.argmax(np.abs(np.diff(levels))))
-    dwell = round(waveform.dwell_s * rate_hz)
-    begin = segment.start + largest * dwell + round(waveform.rise_s * rate_hz) + 1
-    return recording.samples.part(begin, segment.start + (largest + 1) * dwell)
 
 
 @dataclass(frozen=True, slots=True)
@@ -236,8 +220,7 @@ class RunDigest:
 def digest_of(recording: Recording, model: HysteresisModel | None = None) -> RunDigest:
     """Return the digest of a recording, compared with a model, the recorded one if None."""
     values = _experiment(recording)
-    waveform = _waveform(values)
-    structure = _structure(recording, waveform)
+    structure = _structure(recording)
     report = summarize(recording)
     worst = recording.segments[worst_segment(report.segments)] if recording.segments else None
     return RunDigest(
@@ -255,7 +238,9 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
         waveform=worst.label if worst else "",
         figures=_figures(recording, report, worst, structure),
         **(_loop(recording, worst, model) if worst and worst.is_loop else {}),
-        step=_shown_step(recording, waveform, structure),
+        step=_shown_step(recording, structure)
+        if isinstance(structure, StepResponse)
+        else _NO_LOOP.copy(),
         response=structure if isinstance(structure, FrequencyResponse) else None,
     )
 
@@ -266,13 +251,6 @@ def _experiment(recording: Recording) -> Mapping[str, Any]:
     except InputError:  # of another version, or damaged
         return {}
     return data if isinstance(data, dict) else {}
-
-
-def _waveform(values: Mapping[str, Any]) -> Any:
-    try:
-        return TypeAdapter(AnyWaveform).validate_python(values.get("waveform"))
-    except ValidationError:  # as above
-        return None
 
 
 def _loop(recording: Recording, segment: Segment, model: HysteresisModel | None) -> dict[str, Any]:
@@ -309,18 +287,14 @@ def _modelled(
     }
 
 
-def _shown_step(
-    recording: Recording, waveform: Any, structure: FrequencyResponse | Ringing | None
-) -> F64:
-    if not isinstance(waveform, Step) or not recording.segments:
-        return _NO_LOOP.copy()
-    samples = _after_step(recording, waveform)
-    if not samples.index.size:
-        return _NO_LOOP.copy()
-    t = (samples.index - samples.index[0]) / recording.sample_rate_hz
-    if structure is not None and structure.natural_hz is not None:
+def _shown_step(recording: Recording, found: StepResponse) -> F64:
+    rate_hz = recording.sample_rate_hz
+    begin = round(found.start_s * rate_hz)
+    samples = recording.samples.part(begin, begin + round(found.dwell_s * rate_hz))
+    t = (samples.index - begin) / rate_hz
+    if found.natural_hz is not None:
         # Few cycles: decimate, because minima and maxima would form a zigzag.
-        part = t <= _STEP_CYCLES / structure.natural_hz
+        part = t <= _STEP_CYCLES / found.natural_hz
         step = max(1, int(np.count_nonzero(part)) // _STEP_POINTS)
         return np.array((t[part][::step], samples.displacement_um[part][::step]))
     return np.array(min_max(t, samples.displacement_um, _STEP_POINTS))
