@@ -64,9 +64,7 @@ class StartOutcome:
     """One start of a search."""
 
     start: str  # ``data``, ``random N``, or ``weights N`` for a linear solution
-    first_rms_percent: float  # weighted error at the start, in percent of the largest peak-to-peak
-    rms_percent: float
-    evaluations: int  # evaluations of the criterion, without those for derivatives
+    rms_percent: float  # weighted error at its end, in percent of the largest peak-to-peak
 
 
 @dataclass(frozen=True)

@@ -93,14 +93,12 @@ SLACK = 1e-6  # slope at a bound that is left alone, relative to the largest
 STEP_RIDGE = 1e-10  # of the largest diagonal element
 
 
-def descend(
-    evaluate: ErrorAndSlopes, x: F64, low: F64, high: F64, rounds: int
-) -> tuple[F64, F64, F64]:
+def descend(evaluate: ErrorAndSlopes, x: F64, low: F64, high: F64, rounds: int) -> tuple[F64, F64]:
     """Minimise the sum of squares within bounds (Levenberg-Marquardt).
 
     Columns are scaled to length 1. A parameter whose step would exceed a bound stops there and may
-    leave it in the next step; parameters with equal bounds are fixed. Return the point, its errors
-    and their derivatives, after at most ``rounds`` steps.
+    leave it in the next step; parameters with equal bounds are fixed. Return the point and its
+    errors, after at most ``rounds`` steps.
     """
     free = np.flatnonzero(high > low)
     x = np.clip(x, low, high)
@@ -121,7 +119,7 @@ def descend(
         damping = max(0.2 * damping, 1e-9)
         if before - after < SETTLED_SQUARES * before:
             break
-    return x, errors, slopes
+    return x, errors
 
 
 def _step(errors: F64, slopes: F64, low: F64, high: F64, damping: float) -> F64:
@@ -218,8 +216,8 @@ def converged(
     high: F64,
     evaluations: int,
     slopes: Callable[[F64], F64] | None = None,
-) -> tuple[F64, int]:
-    """Return the end of bounded least squares from ``x``, and the number of evaluations.
+) -> F64:
+    """Return the end of bounded least squares from ``x``.
 
     Numerical derivatives are central differences: one-sided ones have eight digits only, and the
     rounding, which differs between processors, would grow from step to step. The maximum of
@@ -234,7 +232,7 @@ def converged(
         x_scale="jac",
         max_nfev=evaluations,
     )
-    return np.asarray(found.x, dtype=np.float64), int(found.nfev)
+    return np.asarray(found.x, dtype=np.float64)
 
 
 def first_least(values: Sequence[float]) -> int:

@@ -251,11 +251,11 @@ def fit_generalised(job: FitJob) -> FoundModel:
         for shift in _SHIFTS
     ]
     ends = [
-        converged(few.error_um, begin, low, high, _FEW_EVALUATIONS)[0]
+        converged(few.error_um, begin, low, high, _FEW_EVALUATIONS)
         for begin in sorted(points, key=few.square)[:_FOLLOWED]
     ]
     best = ends[first_least([few.square(end) for end in ends])]
-    x, _ = converged(problem.error_um, best, low, high, _POLISH)
+    x = converged(problem.error_um, best, low, high, _POLISH)
     weights, offset_um, _ = problem.solve(x)
     rising, falling = problem.envelopes(x)
     model = GeneralisedModel(
@@ -312,8 +312,7 @@ class _DifferentialLoop(_ShapeSearch):
         begin = min(points, key=self.square)
         low, high = np.array([-6.0, -0.95]), np.array([5.0, 1.0])
         size = begin.size
-        x, _ = converged(self.error_um, begin, low[:size], high[:size], _EVALUATIONS)
-        return x
+        return converged(self.error_um, begin, low[:size], high[:size], _EVALUATIONS)
 
 
 def fit_bouc_wen(job: FitJob) -> FoundModel:

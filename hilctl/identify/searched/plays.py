@@ -77,17 +77,15 @@ def search(
     for i, point in enumerate(points):
         name = f"random {i}" if i else "data"
         progress(i / (starts + 1), f"start {i + 1} of {starts}")
-        x, evaluations = polished(problem, point, scale, EVALUATIONS)
-        ends.append(x)
-        outcomes.append(StartOutcome(name, percent(point), percent(x), evaluations))
+        ends.append(polished(problem, point, scale, EVALUATIONS))
+        outcomes.append(StartOutcome(name, percent(ends[-1])))
     progress(starts / (starts + 1), "following the best start to its end")
     best = ends[first_least([outcome.rms_percent for outcome in outcomes])]
-    best, _ = polished(problem, best, scale, POLISH)
-    return best, tuple(outcomes)
+    return polished(problem, best, scale, POLISH), tuple(outcomes)
 
 
-def polished(problem: "SearchProblem", x: F64, scale: F64, evaluations: int) -> tuple[F64, int]:
-    """Return the end of bounded least squares from ``x``, and the evaluations."""
+def polished(problem: "SearchProblem", x: F64, scale: F64, evaluations: int) -> F64:
+    """Return the end of bounded least squares from ``x``."""
     space = problem.space
 
     def residuals(point: F64) -> F64:

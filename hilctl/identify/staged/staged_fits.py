@@ -27,7 +27,6 @@ from hilctl.identify.fit_data import (
     Linear,
 )
 from hilctl.identify.least_squares import (
-    ErrorAndSlopes,
     bounded_weights,
     descend,
     first_least,
@@ -157,23 +156,16 @@ class StagedTask:
     scale: F64
     rounds: int
 
-    def evaluate(self, scale: F64) -> ErrorAndSlopes:
-        """Return the scaled errors and derivatives as a function of all parameters."""
-        even = bool(np.all(scale == 1.0))
-
-        def run(x: F64) -> tuple[F64, F64]:
-            errors, slopes = error_and_slopes(self.data, self.layers, self.point.unpack(x))
-            if even:
-                return errors, slopes
-            return errors * scale, slopes * scale[:, None]
-
-        return run
-
 
 def descended(task: StagedTask) -> tuple[F64, float]:
     """Return the end of a start, float64[p], and its sum of squares."""
+
+    def evaluate(x: F64) -> tuple[F64, F64]:
+        errors, slopes = error_and_slopes(task.data, task.layers, task.point.unpack(x))
+        return errors * task.scale, slopes * task.scale[:, None]
+
     low, high = bounds(task.data, task.layers, task.point)
-    x, errors, _ = descend(task.evaluate(task.scale), task.point.pack(), low, high, task.rounds)
+    x, errors = descend(evaluate, task.point.pack(), low, high, task.rounds)
     return x, float(errors @ errors)
 
 
@@ -194,8 +186,10 @@ def find_staged(job: FitJob, data: FitData, layers: Layers) -> StagedEnd:
     progress(0.2, f"following {len(ranked)} starts")
     tasks = [StagedTask(few, layers, point, few_scale, ROUNDS) for _, point in ranked]
     ends = list(job.run(descended, tasks))
+    to_percent = 100.0 / (data.stroke_um * math.sqrt(few.target_um.size))
     outcomes = [
-        _outcome(i, task, end) for i, (task, end) in enumerate(zip(tasks, ends, strict=True))
+        StartOutcome(f"weights {i}", math.sqrt(square) * to_percent)
+        for i, (_, square) in enumerate(ends, start=1)
     ]
     best = first_least([end[1] for end in ends])
     progress(0.6, "following the best start to its end")
@@ -238,17 +232,6 @@ def _grid(data: FitData, layers: Layers, scale: F64) -> list[tuple[float, Point]
         late_s = delay_s + loop_delay_s(layers.half_period_s, lag_s)
         found.append(convex_start(data, layers, before, late_s, scale))
     return found
-
-
-def _outcome(number: int, task: StagedTask, end: tuple[F64, float]) -> StartOutcome:
-    first, _ = task.evaluate(task.scale)(task.point.pack())
-    to_percent = 100.0 / (task.data.stroke_um * math.sqrt(first.size))
-    return StartOutcome(
-        start=f"weights {number + 1}",
-        first_rms_percent=float(np.linalg.norm(first)) * to_percent,
-        rms_percent=math.sqrt(end[1]) * to_percent,
-        evaluations=task.rounds,
-    )
 
 
 DELAY, C_S, Q_S2 = range(SPACING + 2, DYNAMIC)

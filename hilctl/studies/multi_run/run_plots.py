@@ -37,7 +37,6 @@ Item = TypeVar("Item")
 Measured: TypeAlias = tuple[SeriesRun, RunDigest]
 
 _SIGNS = ("o", "s", "^", "D", "v", "P", "X", "<", ">")
-_LINES = ("-", "--", "-.", ":")
 _MOST_CURVES = 7  # most distinguishable curves
 
 
@@ -69,11 +68,6 @@ def _of_names(names: Sequence[Hashable]) -> list[str]:
         return [NAMED[k % len(NAMED)] for k in range(len(names))]
     others = cycle(colour for colour in NAMED if colour != WITHOUT)
     return [WITHOUT if name == WITHOUT_COMPENSATOR else next(others) for name in names]
-
-
-def line_of(look: Mapping[str, Any], number: int = 0) -> dict[str, Any]:
-    """Return a line style without a marker; its number selects the dashes."""
-    return {"color": look["color"], "linestyle": _LINES[number % len(_LINES)]}
 
 
 _MOST_PANELS = 6
@@ -126,8 +120,8 @@ def _draw_loops(axes: Axes, along: VariedParameter, runs: Sequence[Measured]) ->
     own = looks(along, [run.values[along.key] for run, _ in shown])
     for run, digest in shown:
         value = run.values[along.key]
-        style = line_of(look.get(value) or own[value])
-        axes.plot(*digest.loop, **style, linewidth=0.9, label=along.text(value))
+        colour = (look.get(value) or own[value])["color"]
+        axes.plot(*digest.loop, color=colour, linewidth=0.9, label=along.text(value))
         axes.set(xlabel=_input_axis(digest), ylabel=_DISPLACEMENT_AXIS)
 
 
@@ -222,7 +216,7 @@ def _draw_pair(axes: Axes, before: RunDigest, after: Sequence[tuple[str, RunDige
     look = looks(None, [name for name, _ in lines])
     axes.plot([0, 100], [0, 100], color=REFERENCE, linestyle=":", linewidth=0.8)
     for name, digest in lines:
-        axes.plot(*of_range(digest.loop), **line_of(look[name]), linewidth=0.9, label=name)
+        axes.plot(*of_range(digest.loop), color=look[name]["color"], linewidth=0.9, label=name)
     axes.set(xlabel="input, % of its range", ylabel="displacement, % of its range")
 
 
@@ -257,7 +251,8 @@ def _draw_error(axes: Axes, text: Callable[[SeriesRun], str], runs: Sequence[Mea
         VariedParameter("", "", "", tuple(map(float, range(len(shown))))), range(len(shown))
     )
     for number, (run, digest) in enumerate(shown):
-        axes.plot(*digest.error_um, **line_of(shades[number]), linewidth=0.9, label=text(run))
+        colour = shades[number]["color"]
+        axes.plot(*digest.error_um, color=colour, linewidth=0.9, label=text(run))
     axes.set(xlabel="phase, cycles", ylabel="error, µm", xlim=(0.0, 1.0))
 
 
@@ -287,7 +282,7 @@ def _title(series: RunSeries, run: SeriesRun) -> str:
 def _draw_step(axes: Axes, digest: RunDigest) -> None:
     t, moved = digest.step
     natural, damping = digest.figures.natural_hz, digest.figures.damping_ratio
-    axes.plot(1e3 * t, moved, **line_of(looks(None, [0])[0]))
+    axes.plot(1e3 * t, moved, color=NAMED[0])
     axes.set(xlabel="time after the step, ms", ylabel="displacement, µm")
     if natural and damping is not None:
         text = f"{quantity(natural, 'Hz')}, damping ratio {significant(damping)}"

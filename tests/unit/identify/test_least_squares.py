@@ -47,12 +47,11 @@ RANDOM = np.random.default_rng(5)
 def test_linear_problem_with_bounds_is_solved():
     table, target = RANDOM.normal(size=(50, 6)), RANDOM.normal(size=50)
     low, high = np.full(6, -0.05), np.full(6, 0.08)
-    x, errors, slopes = descend(lambda x: (table @ x - target, table), np.zeros(6), low, high, 60)
+    x, errors = descend(lambda x: (table @ x - target, table), np.zeros(6), low, high, 60)
     expected = lsq_linear(table, target, (low, high), tol=1e-14)
     assert float(errors @ errors) == pytest.approx(2.0 * expected.cost, rel=1e-3)
     np.testing.assert_allclose(x, expected.x, atol=2e-3)
     assert np.any(x == low) or np.any(x == high)
-    assert slopes is table
 
 
 def test_curved_problem_ends_where_scipy_does():
@@ -65,7 +64,7 @@ def test_curved_problem_ends_where_scipy_does():
         return x[0] * decay + x[2] - target, slopes
 
     low, high = np.array([0.0, 0.0, 0.3]), np.array([5.0, 10.0, 0.3])
-    x, errors, _ = descend(evaluate, np.array([1.0, 1.0, 0.3]), low, high, 60)
+    x, errors = descend(evaluate, np.array([1.0, 1.0, 0.3]), low, high, 60)
     assert x[2] == 0.3
     free = least_squares(lambda p: evaluate(np.array([*p, 0.3]))[0], [1.0, 1.0])
     assert float(errors @ errors) == pytest.approx(2.0 * free.cost, rel=1e-3)

@@ -11,7 +11,6 @@ from hilctl.studies.multi_run.collect import RunSeries
 from hilctl.studies.multi_run.run_plots import (
     before_after_sheet,
     error_sheet,
-    line_of,
     looks,
     loop_sheets,
     minor_loop_sheet,
@@ -39,7 +38,6 @@ def test_names_have_colours_and_signs_of_their_own():
     found = looks(None, ["none", "b", "c"])
     assert len({look["color"] for look in found.values()}) == 3
     assert len({look["marker"] for look in found.values()}) == 3
-    assert "marker" not in line_of(found["b"])
 
 
 def test_runs_without_a_compensator_look_as_on_the_page_of_a_single_run():
