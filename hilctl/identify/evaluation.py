@@ -86,7 +86,11 @@ def judge(
 ) -> Evaluation:
     """Return the errors of a model on records; loops are in their periodic steady state."""
     data = data if isinstance(data, FitData) else FitData(data)
-    responses_um = _modelled_um(model, data)
+    if isinstance(model, PlayModel):
+        responses_um = data.response_um(model)
+    else:
+        parts = parallel_map(lambda each: _record_um(model, each), data.records)
+        responses_um = np.concatenate(parts)
     if creep:
         responses_um = data.with_creep(responses_um)
     return judgement_of(data, responses_um, stroke_um)
@@ -200,13 +204,6 @@ def largest_errors(errors: Sequence[StrokeError]) -> tuple[StrokeError, ...]:
     """Return the largest error of each class."""
     found = {each.label: each for each in sorted(errors, key=lambda each: each.peak_percent)}
     return tuple(found[name] for name in STROKES if name in found)
-
-
-def _modelled_um(model: HysteresisModel, data: FitData) -> F64:
-    """Return the modelled displacement of all evaluated samples: float64[N]."""
-    if isinstance(model, PlayModel):
-        return data.response_um(model)
-    return np.concatenate(parallel_map(lambda each: _record_um(model, each), data.records))
 
 
 def _record_um(model: HysteresisModel, record: Record) -> F64:

@@ -133,11 +133,6 @@ Lagged: TypeAlias = tuple[list[F64], list[F64]]
 """Each record's command after a lag, and its derivatives float64[n, 4]."""
 SETTLED = 20.0  # time constants until a lag is settled
 MOST_SUBSTEPS = 200
-WITHOUT_STAGES = (
-    "omit --whole if they repeat, otherwise use a model without stages "
-    "(--model integrated, or --set lag=none --set structure=false --set delay=false)"
-)
-"""Remedy for data that are not steady loops."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -359,14 +354,11 @@ class FitData:
             return signals
         out = np.empty_like(signals)
         for run in self._runs:
-            response = linear.response(_harmonics(run))[:, None]
+            assert run.s is not None  # dynamic stages are for steady loops only
+            response = linear.response(run.s)[:, None]
             spectrum = rfft(signals[run.place], axis=0) * response
             out[run.place] = irfft(spectrum, _size(run.place), axis=0)
         return out
-
-    def undelayed(self, delay_s: float) -> F64:
-        """Return the measured displacements without a delay: float64[N]."""
-        return self.through(self.target_um[:, None], Linear(-delay_s))[:, 0]
 
     def linear_slopes(self, signal: F64, linear: Linear) -> F64:
         """Return the derivatives of a signal's response by delay, c and q: float64[N, 3]."""
@@ -415,9 +407,3 @@ class FitData:
 
 def _size(place: slice) -> int:
     return int(place.stop - place.start)
-
-
-def _harmonics(run: _Run) -> Spectrum:
-    if run.s is None:
-        raise DataError(f"lag, structure and delay need steady loops: {WITHOUT_STAGES}")
-    return run.s

@@ -22,7 +22,6 @@ from hilctl.identify.fit_data import (
     GROWTH,
     LAG_S,
     SPACING,
-    WITHOUT_STAGES,
     FitData,
     Linear,
 )
@@ -67,7 +66,7 @@ def convex_start(
     blank = np.zeros(layers.plays)
     lagged = data.lagged(float(before[0]), float(before[1]))
     w, outputs, _ = data.plays(before, layers.numbers, blank, lagged)
-    y = data.undelayed(delay_s) if delay_s else data.target_um
+    y = data.through(data.target_um[:, None], Linear(-delay_s))[:, 0]
     knots = np.linspace(float(y.min()), float(y.max()), KNOTS + 1)
     middle = 0.5 * (knots[0] + knots[-1]) if layers.offset else 0.0
     # The slope around the middle follows from the others and the mean of 1.
@@ -209,7 +208,9 @@ def find_staged(job: FitJob, data: FitData, layers: Layers) -> StagedEnd:
 def _check(data: FitData, layers: Layers) -> None:
     if layers.dynamic and not data.all_steady:
         raise DataError(
-            f"lag, structure and delay need steady loops, but there is a history: {WITHOUT_STAGES}"
+            "lag, structure and delay need steady loops, but there is a history: omit --whole if "
+            "they repeat, otherwise use a model without stages (--model integrated, or "
+            "--set lag=none --set structure=false --set delay=false)"
         )
     if layers.dynamic and not data.one_rate:
         raise DataError(

@@ -7,7 +7,7 @@ their pauses followed each other.
 
 import tempfile
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 from hilctl.base.errors import HilctlError, InputError
@@ -22,13 +22,13 @@ from hilctl.studies.campaign.campaign_runner import (
     Campaign,
     CampaignResult,
     is_harmless,
+    measured,
 )
 from hilctl.studies.campaign.plan import CampaignPlan, PlannedStep, planned
 from hilctl.studies.campaign.steps import CampaignSteps
 from hilctl.studies.campaign.store import completed_runs, new_recording
 from hilctl.studies.campaign.table import CampaignRow
 from hilctl.studies.multi_run.collect import COMPLETED
-from hilctl.studies.multi_run.digest import RunDigest, RunFigures, digest_of
 from hilctl.studies.step_runner import StudyHost
 
 
@@ -42,19 +42,12 @@ class FastTask:
     heat_a2: float  # heat of the coil before it, in A^2
 
 
-@dataclass(frozen=True, slots=True)
-class FastRun:
-    """Outcome of one run."""
+def run_task(task: FastTask) -> tuple[bytes, CampaignRow, bool]:
+    """Run one step on a worker.
 
-    recording: bytes  # its recording as bytes; empty if it was refused
-    code: str  # ``completed``, ``fault`` or ``refused``
-    reason: str
-    harmless: bool  # whether the next step may run
-    digest: RunDigest | None = None  # data of its recording; None if it was not completed
-
-
-def run_task(task: FastTask) -> FastRun:
-    """Run one step on a worker."""
+    Return its recording, which is empty if it was refused, its row, and whether the next step may
+    run.
+    """
     document = Document("experiment", task.experiment)
     loaded = resolve(document, Path(task.folder), files=TextFiles(task.files))
     with tempfile.TemporaryDirectory(prefix="hilctl-campaign-") as folder:
@@ -62,11 +55,12 @@ def run_task(task: FastTask) -> FastRun:
         try:
             result = run_unpaced(check(loaded, task.heat_a2), output)
         except HilctlError as error:
-            return FastRun(b"", "refused", str(error), harmless=True)
-        content, recording = output.read_bytes(), read(output)
-        harmless = result.code == COMPLETED or is_harmless(result)
-        digest = digest_of(recording) if result.code == COMPLETED else None
-        return FastRun(content, result.code, result.reason, harmless, digest)
+            return b"", CampaignRow(f"refused: {error}", code="refused"), True
+        content = output.read_bytes()
+        if result.code == COMPLETED:
+            return content, measured(read(output)), True
+        row = CampaignRow(f"{result.code}: {result.reason}", code=result.code)
+        return content, row, is_harmless(result)
 
 
 def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
@@ -88,11 +82,11 @@ def run_fast(plan: CampaignPlan, host: StudyHost, scheduler: str = "none") -> Ca
         state = Campaign(plan, host)
         state.keep()
         runs = run(run_task, [_task(each) for each in left])
-        for number, (each, fast) in enumerate(zip(left, runs, strict=True), 1):
-            _take(state, each, fast)
+        for number, (each, (content, row, harmless)) in enumerate(zip(left, runs, strict=True), 1):
+            state.add(each, _recorded(plan, each, content, row) if content else row)
             host.on_progress(number / len(left), f"{len(left) - number} of {len(left)} runs left")
-            if not fast.harmless:
-                return state.result(f"{each.step.text}: {fast.reason}")
+            if not harmless:
+                return state.result(f"{each.step.text}: {row.result}")
     return state.result()
 
 
@@ -102,13 +96,9 @@ def _task(each: PlannedStep) -> FastTask:
     return FastTask(loaded.yaml_text, dict(loaded.files.texts), folder, each.heat_a2)
 
 
-def _take(state: Campaign, each: PlannedStep, run: FastRun) -> None:
-    name = state.plan.campaign.config.name
-    if not run.recording:
-        state.add(each, CampaignRow(f"refused: {run.reason}", code="refused"))
-        return
-    path = new_recording(state.plan.folder, name, each.step.number)
-    write_file(path, lambda stream: stream.write(run.recording), overwrite=False)
-    result = COMPLETED if run.code == COMPLETED else f"{run.code}: {run.reason}"
-    figures = run.digest.figures if run.digest else RunFigures()
-    state.add(each, CampaignRow(result, figures, path.name, run.code, digest=run.digest))
+def _recorded(
+    plan: CampaignPlan, each: PlannedStep, content: bytes, row: CampaignRow
+) -> CampaignRow:
+    path = new_recording(plan.folder, plan.campaign.config.name, each.step.number)
+    write_file(path, lambda stream: stream.write(content), overwrite=False)
+    return replace(row, recording=path.name)
