@@ -55,6 +55,13 @@ class LoadedExperiment:
         """Return a broken rule with the place of its key in the file."""
         return ConfigProblem(self.document.where(tuple(key.split("."))), key, rule, value, hint)
 
+    def noise_settings(self, number: int) -> list[str]:
+        """Return the settings for other noise of a simulated device in each run of several."""
+        seed = self.device.Options.model_fields.get("seed")
+        if seed is None:
+            return []
+        return [f"device.seed={self.config.device.get('seed', seed.default) + number}"]
+
 
 def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperiment:
     """Read an experiment file, apply ``key=value`` settings, and load what it refers to.

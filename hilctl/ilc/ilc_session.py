@@ -236,22 +236,14 @@ class IlcSession:
             for segment, each in zip(self._segments, coefficients, strict=True)
         ]
         write_correction(file, self._whole(cycles), overwrite=True)
-        settings = [*self._settings, correction_setting(file), *self._other_noise(number)]
+        noise = self._checked.loaded.noise_settings(number)  # which must not be learned
+        settings = [*self._settings, correction_setting(file), *noise]
         result = self._run(self._experiment, settings, self._folder / f"{name}.mcap")
         if result.stop_signal and self._rows:
             raise StepStoppedError(f"run {number}: {result.reason}", result.stop_signal)
         if result.code != "completed":
             raise RunError(f"run {number}: {result.reason}")
         return result.path
-
-    def _other_noise(self, number: int) -> list[str]:
-        """Return a new seed for the noise of a simulated device, which must not be learned."""
-        device = self._checked.loaded.device
-        field = device.Options.model_fields.get("seed")
-        if field is None:
-            return []
-        first = self._checked.loaded.config.device.get("seed", field.default)
-        return [f"device.seed={first + number}"]
 
     def _judge(self, number: int, path: Path, *, learning: bool) -> list[IlcRow]:
         recording = read(path)

@@ -302,11 +302,8 @@ class CharacterisationRunner:
         settings = [*self._settings, setting("name", name), setting("waveform", keys)]
         if self._rows and self._loaded.config.safe.at_start is not None:
             settings.append(f"safe.at_start={self.limits.rest!r}")  # where the previous step ended
-        seed = self._loaded.device.Options.model_fields.get("seed")
-        if seed is not None:  # noise common to all steps would be fitted
-            first = self._loaded.config.device.get("seed", seed.default)
-            settings.append(f"device.seed={first + number}")
-        return settings
+        # Noise common to all steps would be fitted.
+        return settings + self._loaded.noise_settings(number)
 
 
 def _fault(step: CharacterisationStep, result: RunResult, recording: Recording) -> RunError:
