@@ -23,13 +23,10 @@ from hilctl.identify.refine.refinement import Refinement
 from hilctl.identify.registry import CATALOGUE
 from hilctl.identify.settings import setting_rows
 from hilctl.identify.summary import (
-    CLASS_HEADINGS,
-    HEADINGS,
-    REFINEMENT_HEADINGS,
-    class_rows,
-    error_rows,
+    class_table,
+    loop_table,
     parameter_texts,
-    refinement_rows,
+    refinement_table,
     summary,
     worse_lines,
 )
@@ -269,8 +266,8 @@ def print_refinement(result: Refinement, output: Path | None) -> None:
     for line in worse_lines(result):
         print(line)
     title = f"validation: {result.choice.after.how}"
-    print_rich(table(title, REFINEMENT_HEADINGS, refinement_rows(result)))
-    print_rich(table("by stroke", CLASS_HEADINGS, class_rows(result)))
+    print_rich(table(title, *refinement_table(result)))
+    print_rich(table("by stroke", *class_table(result)))
     if result.choice.own:
         print("offset, creep and drift of single runs were not learned")
     if output is not None:
@@ -353,10 +350,10 @@ def print_identification(result: Identification, output: Path | None) -> None:
     if result.orders:
         print_rich(_orders_table(result.orders))
     if held_out is not None:
-        rows = error_rows(held_out.judgement.errors)
-        print_rich(table(f"validation: {held_out.how}", HEADINGS, rows, left={"loop"}))
+        loops = loop_table(held_out.judgement.errors)
+        print_rich(table(f"validation: {held_out.how}", *loops, left={"loop"}))
     title = f"fit: {fit.model.provenance.method}"
-    print_rich(table(title, HEADINGS, error_rows(fit.errors), left={"loop"}))
+    print_rich(table(title, *loop_table(fit.errors), left={"loop"}))
     if parameters := ", ".join(f"{name} {text}" for name, text in parameter_texts(fit)):
         print(f"parameters: {parameters}")
     if output is not None:

@@ -16,15 +16,11 @@ from hilctl.identify.model_quality import Verdict
 from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
 from hilctl.identify.summary import (
-    CLASS_HEADINGS,
-    HEADINGS,
-    REFINEMENT_HEADINGS,
-    STROKE_HEADINGS,
-    class_rows,
-    error_rows,
+    class_table,
+    loop_table,
     parameter_texts,
-    refinement_rows,
-    stroke_rows,
+    refinement_table,
+    stroke_table,
     summary,
     worse_lines,
 )
@@ -44,12 +40,12 @@ def identification_page(found: Identification) -> str:
     body += errors_by_stroke(found.verdict)
     if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on data not fitted</h2>"]
-        body += [html.grid(HEADINGS, error_rows(held_out.judgement.errors))]
+        body += [html.grid(*loop_table(held_out.judgement.errors))]
         body += ["<h2>Model and data not fitted</h2>"]
         body += drawn_records(held_out.judgement, held_out.records, unit)
     body += [
         "<h2>Errors on data fitted</h2>",
-        html.grid(HEADINGS, error_rows(fit.errors)),
+        html.grid(*loop_table(fit.errors)),
         "<h2>Model and data</h2>",
         *drawn_records(fit, found.data, unit),
         "<h2>Parameters</h2>",
@@ -81,7 +77,7 @@ def errors_by_stroke(verdict: Verdict) -> list[str]:
     figure = FigureSpec("strokes", caption, (Panel(draw, height=0.5),))
     return [
         "<h2>Errors by stroke</h2>",
-        html.grid(STROKE_HEADINGS, stroke_rows(verdict)),
+        html.grid(*stroke_table(verdict)),
         html.figures([figure]),
     ]
 
@@ -149,9 +145,9 @@ def refinement_page(found: Refinement) -> str:
     body = [
         *_head("Refined model", found.model, [str(found), *worse_lines(found), after.how]),
         "<h2>Errors on runs not fitted</h2>",
-        html.grid(REFINEMENT_HEADINGS, refinement_rows(found)),
+        html.grid(*refinement_table(found)),
         "<h2>Errors by stroke</h2>",
-        html.grid(CLASS_HEADINGS, class_rows(found)),
+        html.grid(*class_table(found)),
     ]
     for heading, held in (("Before", found.choice.before), ("After", after)):
         body += [f"<h2>{heading}</h2>"]

@@ -1,6 +1,7 @@
 """Text rows and lines about an identified or a refined model."""
 
 from collections.abc import Sequence
+from typing import TypeAlias
 
 from hilctl.identify.evaluation import Evaluation, LoopScore
 from hilctl.identify.fit_model import FittedModel
@@ -8,20 +9,18 @@ from hilctl.identify.model_quality import Verdict
 from hilctl.identify.pipeline import Identification
 from hilctl.identify.refine.refinement import Refinement
 
-REFINEMENT_HEADINGS = ("run", "p-p µm", "peak % before", "after", "rms % before", "after")
-CLASS_HEADINGS = ("class", "largest p-p µm", "peak % before", "after", "rms % before", "after")
-STROKE_HEADINGS = ("stroke", "peak %", "rms %", "motions")
-HEADINGS = ("loop", "p-p µm", "peak %", "rms %", "area %")
+Table: TypeAlias = tuple[tuple[str, ...], list[tuple[str, ...]]]
+"""Headings, and rows of texts."""
 
 
-def error_rows(errors: Sequence[LoopScore]) -> list[tuple[str, ...]]:
-    """Return one row per loop under :data:`HEADINGS`."""
+def loop_table(errors: Sequence[LoopScore]) -> Table:
+    """Return the errors of each loop."""
     rows = []
     for error in errors:
         area = "-" if error.area_error_percent is None else f"{error.area_error_percent:+.2f}"
         figures = (error.peak_to_peak_um, error.peak_percent, error.rms_percent)
         rows.append((error.label, *(f"{figure:.3g}" for figure in figures), area))
-    return rows
+    return ("loop", "p-p µm", "peak %", "rms %", "area %"), rows
 
 
 def parameter_texts(fit: FittedModel) -> list[tuple[str, str]]:
@@ -74,29 +73,29 @@ def _span(limits: tuple[float, float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def refinement_rows(found: Refinement) -> list[tuple[str, ...]]:
-    """Return one row per held-out run under :data:`REFINEMENT_HEADINGS`."""
+def refinement_table(found: Refinement) -> Table:
+    """Return the errors of each held-out run before and after."""
     before, after = (held.judgement.errors for held in (found.choice.before, found.choice.after))
     rows = []
     for was, now in zip(before, after, strict=True):
         figures = [was.peak_to_peak_um, was.peak_percent, now.peak_percent]
         figures += [was.rms_percent, now.rms_percent]
         rows.append((was.label, *(f"{figure:.3g}" for figure in figures)))
-    return rows
+    return ("run", "p-p µm", "peak % before", "after", "rms % before", "after"), rows
 
 
-def class_rows(found: Refinement) -> list[tuple[str, ...]]:
-    """Return one row per class of held-out runs under :data:`CLASS_HEADINGS`."""
+def class_table(found: Refinement) -> Table:
+    """Return the errors of each class of held-out runs before and after."""
     rows = []
     for each in found.choice.classes:
         figures = [each.peak_to_peak_um, each.peak_before, each.peak_after]
         rows.append((each.label, *(f"{n:.3g}" for n in (*figures, each.before, each.after))))
-    return rows
+    return ("class", "largest p-p µm", "peak % before", "after", "rms % before", "after"), rows
 
 
-def stroke_rows(verdict: Verdict) -> list[tuple[str, ...]]:
-    """Return one row per class of motions under :data:`STROKE_HEADINGS`."""
-    return [
+def stroke_table(verdict: Verdict) -> Table:
+    """Return the errors of each class of motions."""
+    return ("stroke", "peak %", "rms %", "motions"), [
         (each.label, f"{each.peak_percent:.3g}", f"{each.rms_percent:.3g}", f"{each.motions}")
         for each in verdict.classes
     ]

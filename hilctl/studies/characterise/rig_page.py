@@ -23,7 +23,7 @@ from hilctl.analysis.response.bode import response_sheet
 from hilctl.base.formatting import quantity, significant
 from hilctl.base.types import F64
 from hilctl.identify.model_page import drawn_records, errors_by_stroke
-from hilctl.identify.summary import HEADINGS, error_rows, summary
+from hilctl.identify.summary import loop_table, summary
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import StagedModel
 from hilctl.studies.characterise.loops import LoopFigures, ReversalCurves
@@ -231,6 +231,6 @@ def _model(found: Characterisation) -> Iterator[str]:
     yield "<h2>Model</h2>"
     yield html.paragraph(fit.model.provenance.method)
     yield from map(html.paragraph, summary(known))
-    yield html.grid(HEADINGS, error_rows(fit.errors))
+    yield html.grid(*loop_table(fit.errors))
     yield from drawn_records(fit, known.data, fit.model.input_unit)
     yield html.details("Model file", dump_model(fit.model))

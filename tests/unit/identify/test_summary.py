@@ -7,7 +7,7 @@ import pytest
 from hilctl.identify.evaluation import LoopScore, StrokeError
 from hilctl.identify.model_quality import Verdict
 from hilctl.identify.model_selection import CandidateScore
-from hilctl.identify.summary import HEADINGS, error_rows, parameter_texts, summary
+from hilctl.identify.summary import loop_table, parameter_texts, summary
 from hilctl.models.base import IdentifiedRange, Provenance
 
 
@@ -32,9 +32,9 @@ def found(held_out=None, lag_samples=0, starts=(), at_bound=(), known=None):
 
 @pytest.mark.parametrize(("area", "text"), [(None, "-"), (1.5, "+1.50"), (-0.25, "-0.25")])
 def test_the_area_s_error_has_a_sign_and_a_history_has_none(area, text):
-    (row,) = error_rows([LoopScore("sine", 1.25, 0.5, area, 80.0)])
+    headings, (row,) = loop_table([LoopScore("sine", 1.25, 0.5, area, 80.0)])
     assert row == ("sine", "80", "1.25", "0.5", text)
-    assert len(row) == len(HEADINGS)
+    assert len(row) == len(headings)
 
 
 def test_a_parameter_stands_with_its_standard_error_where_there_is_one():

@@ -15,10 +15,8 @@ from hilctl.identify.model_selection import HeldOut
 from hilctl.identify.refine import refinement
 from hilctl.identify.refine.acceptance import AcceptanceRule
 from hilctl.identify.summary import (
-    CLASS_HEADINGS,
-    REFINEMENT_HEADINGS,
-    class_rows,
-    refinement_rows,
+    class_table,
+    refinement_table,
     worse_lines,
 )
 from hilctl.models.model_file import dump_model, load_model
@@ -212,10 +210,11 @@ def test_what_can_not_be_used_is_said(tmp_path):
 @pytest.mark.usefixtures("undrawn")
 def test_page_has_verdict_table_figures_and_model(old, runs):
     found = refinement.refine_runs(old, runs[:3], source="a<b>.yaml")
-    rows = refinement_rows(found)
+    headings, rows = refinement_table(found)
     assert [row[0] for row in rows] == ["run 0", "run 1", "run 2"]
-    assert all(len(row) == len(REFINEMENT_HEADINGS) for row in rows)
-    assert all(len(row) == len(CLASS_HEADINGS) for row in class_rows(found))
+    assert all(len(row) == len(headings) for row in rows)
+    headings, classes = class_table(found)
+    assert all(len(row) == len(headings) for row in classes)
     page = refinement_page(found)
     assert "a&lt;b&gt;.yaml" in page
     assert "<b>" not in page.replace("<body>", "")
