@@ -21,7 +21,6 @@ from hilctl.kernels.hysteresis import stop_step
 from hilctl.models.base import HysteresisModel
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.implicit_models import (
     BoucWenModel,
     DuhemModel,
@@ -30,7 +29,7 @@ from hilctl.models.implicit_models import (
 )
 from hilctl.models.integrated import ButterflyModel, DeadbandFunction, IntegratedModel
 from hilctl.models.model_file import load_model
-from hilctl.models.plays import PpiModel, RdpiModel
+from hilctl.models.plays import GeneralisedModel, PlayEnvelope, PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, FirstMode, StagedModel
 
 ROOT = Path(__file__).parents[1]

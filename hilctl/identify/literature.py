@@ -24,7 +24,6 @@ from hilctl.identify.least_squares import (
 from hilctl.kernels.generalised_play import envelope_outputs
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.kernels.implicit_models import BOUC_WEN, implicit_forward
-from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.implicit_models import (
     NOTHING,
     BoucWenModel,
@@ -32,7 +31,7 @@ from hilctl.models.implicit_models import (
     KrasnoselskiiPokrovskiiModel,
     PreisachModel,
 )
-from hilctl.models.plays import PpiModel
+from hilctl.models.plays import GeneralisedModel, PlayEnvelope, PpiModel
 
 SMOOTHNESS = 0.01  # increases no error, but makes the solution unique
 

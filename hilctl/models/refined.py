@@ -11,7 +11,6 @@ from hilctl.base.strict import CheckedModel, Field
 from hilctl.base.types import F64
 from hilctl.kernels.residual_operator import Tables, residual_forward, residual_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, threshold_problems
-from hilctl.models.generalised_pi import GeneralisedModel
 from hilctl.models.implicit_models import (
     BoucWenModel,
     DuhemModel,
@@ -20,7 +19,7 @@ from hilctl.models.implicit_models import (
 )
 from hilctl.models.integrated import ButterflyModel, IntegratedModel
 from hilctl.models.linear_stages import Chain, FirstMode
-from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
+from hilctl.models.plays import GeneralisedModel, PpiModel, RdpiModel, SpiModel
 from hilctl.models.staged import StagedModel, split_frame
 
 Refinable: TypeAlias = (

@@ -41,11 +41,10 @@ from hilctl.identify.data.cycles import loops_from_pieces
 from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.kernels.hysteresis import play_sum
 from hilctl.models.base import HysteresisModel
-from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.implicit_models import BoucWenModel, KrasnoselskiiPokrovskiiModel, PreisachModel
 from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.models.model_file import dump_model
-from hilctl.models.plays import PpiModel
+from hilctl.models.plays import GeneralisedModel, PlayEnvelope, PpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording import reader, schema
 from hilctl.recording.reader import read

@@ -17,7 +17,6 @@ from hilctl.identify.literature import (
 )
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.staged.staged_fits import fit_free
-from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.implicit_models import (
     BoucWenModel,
     DuhemModel,
@@ -25,7 +24,7 @@ from hilctl.models.implicit_models import (
     PreisachModel,
 )
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
-from hilctl.models.plays import PpiModel
+from hilctl.models.plays import GeneralisedModel, PlayEnvelope, PpiModel
 from tests.published import piezo_ppi
 
 RNG = np.random.default_rng(4)

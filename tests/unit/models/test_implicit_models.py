@@ -10,7 +10,6 @@ from hypothesis.extra import numpy as hnp
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
-from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.implicit_models import (
     TOLERANCE_UM,
     BoucWenModel,
@@ -19,6 +18,7 @@ from hilctl.models.implicit_models import (
     PreisachModel,
 )
 from hilctl.models.model_file import dump_model, parse_model
+from hilctl.models.plays import GeneralisedModel, PlayEnvelope
 
 RATE_HZ = 50_000.0
 LOW, HIGH = SPAN = (-7.0, 8.0)

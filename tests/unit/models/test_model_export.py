@@ -9,10 +9,9 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.models.generalised_pi import GeneralisedModel, PlayEnvelope
 from hilctl.models.model_export import export_text
 from hilctl.models.model_file import AnyModel
-from hilctl.models.plays import SpiModel
+from hilctl.models.plays import GeneralisedModel, PlayEnvelope, SpiModel
 from hilctl.models.refined import RefinedModel
 from hilctl.models.staged import AnyHysteresis, StagedModel
 from tests.published import piezo_ppi, terfenol_rdpi
