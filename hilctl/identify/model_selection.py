@@ -178,7 +178,7 @@ CREEPING: Mapping[str, Any] = {**WHOLE[0], "activation": True}
 """Further candidate for histories whose rests show creep."""
 PLAIN: Mapping[str, Any] = {"kind": "integrated", "offset": True}
 """Further candidate for histories if the error of all others is large."""
-WELL_PERCENT = 0.4  # mean error by stroke that small models of the right kind reach
+WELL_PERCENT = 0.6  # mean error by stroke that small models of the right kind reach
 IN_FULL: Mapping[str, tuple[dict[str, Any], ...]] = {
     "field": ({"kind": "field", "drags": 0}, {"kind": "field"}),
     "generalised_duhem": ({"kind": "generalised_duhem"},),

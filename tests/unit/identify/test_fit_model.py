@@ -349,13 +349,13 @@ def command(levels=(5.0, -5.0, 0.0), rest_s=3.0):
     return np.concatenate(parts)
 
 
-def history(creep=CREEP, *, heat=0.0, drift=0.0, **levels):
+def history(creep=CREEP, *, heat=0.0, drift=0.0, noise_um=NOISE_UM, **levels):
     v = command(**levels)
     x_um = MODEL.forward(SLOW_HZ).process(v)
     y_um = x_um if creep is None else creep.forward(SLOW_HZ, rest_um=-4.0).process(x_um)
     warmed = heat * np.cumsum(v**2) / SLOW_HZ + drift * np.arange(v.size) / SLOW_HZ
-    noise_um = NOISE_UM * np.random.default_rng(2).standard_normal(v.size)
-    return History("h", v, y_um + warmed + noise_um, SLOW_HZ), x_um
+    noise = noise_um * np.random.default_rng(2).standard_normal(v.size)
+    return History("h", v, y_um + warmed + noise, SLOW_HZ), x_um
 
 
 def crept(creep, time_s):
@@ -383,9 +383,9 @@ def test_what_is_left_is_the_displacement_without_creep():
     assert (bare.label, bare.ignore) == (record.label, record.ignore)
 
 
-@pytest.mark.parametrize(("heat", "drift"), [(0.0, 0.0), (0.02, 0.0), (0.0, 0.05)])
-def test_nothing_creeps_where_nothing_does(heat, drift):
-    records = [history(None, heat=heat, drift=drift)[0]]
+@pytest.mark.parametrize("others", [{}, {"heat": 0.02}, {"drift": 0.05}, {"noise_um": 0.05}])
+def test_nothing_creeps_where_nothing_does(others):
+    records = [history(None, **others)[0]]
     assert not creeps(records)
     assert creep_of(records) is None
 
