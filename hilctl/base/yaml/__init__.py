@@ -1,7 +1,7 @@
 """Strict subset of YAML 1.2.
 
 io.py      documents with the line of every value; settings; plain data as YAML
-errors.py  validation errors in words, and tolerant readings of unambiguous values
+errors.py  validation errors in words
 """
 
 from hilctl.base.yaml.errors import Loc, broken_rules, dotted, loc_of

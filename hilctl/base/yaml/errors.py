@@ -1,15 +1,10 @@
-"""Validation errors in words (place, key, rule, value, fix), and tolerant readings.
-
-A decimal comma, a micro sign, or ``1e3`` for a count is accepted if a model expects a number or one
-of a few words and there is only one reading: ``1,5`` is 1.5, but ``1,500`` is ambiguous and
-rejected.
-"""
+"""Validation errors in words: place, key, rule, value, fix."""
 
 import re
 import types
 import typing
 import unicodedata
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from typing import Annotated, Any, NamedTuple, TypeAlias
 
 from pydantic import BaseModel, ValidationError
@@ -28,8 +23,6 @@ NUMBERS = {
 }
 """Regular expressions for plain numbers in YAML 1.2."""
 
-_COMMA = re.compile(r"([-+]?\d+),(\d+)((?:[eE][-+]?\d+)?)")
-_MICRO = str.maketrans({"\N{MICRO SIGN}": "u", "\N{GREEK SMALL LETTER MU}": "u"})
 _DASHES = {"\N{MINUS SIGN}", "\N{EN DASH}", "\N{EM DASH}"}
 _QUOTED = re.compile(r"'([^']+)'")
 _RULES = {
@@ -107,45 +100,6 @@ def broken_rules(
         elif not (each.of_choice and each.loc in meant):
             groups.setdefault(each.loc if each.of_choice else (index, *each.loc), []).append(each)
     return problems + [_problem(group, where, at) for group in groups.values()]
-
-
-def readings(error: ValidationError, model: type[BaseModel]) -> Iterator[tuple[Loc, Any, bool]]:
-    """Yield tolerant readings of rejected values.
-
-    Each is a location, a reading, and whether the reading replaces the key instead of the value.
-    """
-    for each in (_located(model, detail) for detail in error.errors(include_url=False)):
-        value = None if each.of_choice else _read_as(each.detail, each.parent)
-        if value is not None:
-            yield each.loc, value, each.detail["type"] == "extra_forbidden"
-
-
-def _read_as(detail: ErrorDetails, parent: type[BaseModel] | None) -> float | str | None:
-    kind, given = detail["type"], detail["input"]
-    if kind == "float_type" and isinstance(given, str):
-        return _decimal(given)
-    if kind == "int_type" and isinstance(given, float) and given.is_integer():
-        return int(given) if abs(given) < 2.0**53 else None
-    if kind == "literal_error" and isinstance(given, str):
-        word = given.translate(_MICRO)
-        return word if word != given and repr(word) in _expected(detail) else None
-    if kind == "extra_forbidden" and parent is not None:
-        name = str(detail["loc"][-1])
-        key = name.translate(_MICRO)
-        return key if key != name and key in parent.model_fields else None
-    return None
-
-
-def _decimal(text: str) -> float | None:
-    """Return a number with a decimal comma; None if it is ambiguous or no number."""
-    found = _COMMA.fullmatch(text.strip())
-    if found is None:
-        return None
-    whole, part, power = found.groups()
-    digits = whole.lstrip("+-")
-    if len(part) == 3 and len(digits) <= 3 and not digits.startswith("0"):
-        return None
-    return float(f"{whole}.{part}{power}")
 
 
 def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> ConfigProblem:

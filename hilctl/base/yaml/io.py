@@ -13,7 +13,6 @@ Aliases and tags are rejected, because they allow loops and values of other type
 """
 
 import json
-import logging
 import math
 import re
 from collections.abc import Callable, Mapping, Sequence
@@ -27,7 +26,7 @@ from yaml.composer import ComposerError
 
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml.errors import NUMBERS, Loc, broken_rules, dotted, odd_characters, readings
+from hilctl.base.yaml.errors import NUMBERS, Loc, broken_rules, dotted, odd_characters
 
 MAX_DEPTH = 32
 """Largest nesting depth; an experiment has about five levels."""
@@ -38,7 +37,6 @@ MAX_VALUES = 50_000
 
 Model = TypeVar("Model", bound=BaseModel)
 Named = TypeVar("Named")
-_log = logging.getLogger(__name__)
 _UNREADABLE = "is not readable YAML"
 _TAG = "tag:yaml.org,2002:"
 
@@ -283,45 +281,20 @@ class Document:
     ) -> Model:
         """Build a pydantic model from the document or its part ``at``, except the keys ``without``.
 
-        Tolerant readings replace values in :attr:`data`, see
-        :func:`hilctl.base.yaml.errors.readings`. ``context`` is for the validators.
+        ``context`` is for the validators.
 
         Raises:
             ConfigError: One or more rules are broken; all are listed.
         """
-        while True:
-            data = _at(self.data, at)
-            if without:
-                data = {key: value for key, value in data.items() if key not in without}
-            try:
-                return model.model_validate(data, context=context)
-            except ValidationError as error:
-                plain = [each for each in readings(error, model) if self.holds((*at, *each[0]))]
-                if not plain:
-                    raise ConfigError(broken_rules(error, model, self.where, at)) from None
-            for loc, value, is_key in plain:
-                if is_key:
-                    self._rename((*at, *loc), value)
-                else:
-                    self._read_as((*at, *loc), value)
-
-    def _read_as(self, loc: Loc, value: float | str) -> None:
-        if isinstance(value, float):
-            said = f"{_at(self.data, loc)!r} is read as {value:g}"
-            _log.warning("%s: %s: %s", self.where(loc), dotted(loc), said)
-        self.data = _replaced(self.data, loc, value)
-
-    def _rename(self, loc: Loc, name: str) -> None:
-        new, mapping = (*loc[:-1], name), _at(self.data, loc[:-1])
-        if name in mapping:
-            rule = f"stands already at {self.where(new)}"
-            raise ConfigError([ConfigProblem(self.where(loc), dotted(loc), rule)])
-        renamed = {(name if key == loc[-1] else key): value for key, value in mapping.items()}
-        self.data = _replaced(self.data, loc[:-1], renamed)
-        self._places = {
-            (*new, *at[len(loc) :]) if at[: len(loc)] == loc else at: where
-            for at, where in self._places.items()
-        }
+        data: Any = self.data
+        for part in at:
+            data = data[part]
+        if without:
+            data = {key: value for key, value in data.items() if key not in without}
+        try:
+            return model.model_validate(data, context=context)
+        except ValidationError as error:
+            raise ConfigError(broken_rules(error, model, self.where, at)) from None
 
 
 def load_document(path: Path, files: TextFiles | None = None) -> Document:
@@ -361,12 +334,6 @@ def option_file(
             raise ValueError(str(error)) from None
 
     return named
-
-
-def _at(data: Any, loc: Loc) -> Any:
-    for part in loc:
-        data = data[part]
-    return data
 
 
 def _replaced(data: Any, loc: Loc, value: Any) -> Any:
