@@ -1,30 +1,23 @@
-"""Catalogue of the recordings in a folder: facts from both ends of each file, queries in SQLite.
+"""Catalogue of the recordings in a folder: facts from both ends of each file, queries in SQLite."""
 
-The cache is per user, because recordings may be on a read-only shared disk. Its key is path, size
-and modification time of a file. Only finished recordings are cached; others may still change.
-"""
-
-import hashlib
 import json
 import logging
 import math
 import os
 import re
 import sqlite3
-import stat
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import closing
 from functools import partial
 from pathlib import Path
-from typing import TYPE_CHECKING, Any, TypeAlias
+from typing import Any, TypeAlias
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.files import write_text
 from hilctl.base.formatting import printable
+from hilctl.base.segments import Segment
 from hilctl.recording.metadata_keys import END_FIGURES, LABELS_FACT
-
-if TYPE_CHECKING:
-    from hilctl.base.segments import Segment
+from hilctl.recording.run_summary import read_ends
+from hilctl.recording.validation import labels_of, segments_of
 
 _log = logging.getLogger(__name__)
 
@@ -73,7 +66,6 @@ _SQL_TYPES = {str: "TEXT", int: "INTEGER", bool: "INTEGER", float: "REAL", dict:
 _CREATE = "CREATE TABLE recordings ({})".format(
     ", ".join(f"{name} {_SQL_TYPES[kind]}" for name, kind in COLUMNS.items())
 )
-_CACHE_VERSION = 1  # increment if the meaning of a column changes
 _TOKEN = re.compile(
     r"""'[^']*' | "(?P<text>[^"]*)" | \[(?P<bracketed>[^]]*)\]
     | \b(?P<dotted>(?:label|device|waveform)(?:\.\w+)+)""",
@@ -182,56 +174,11 @@ def read_catalogue(folder: Path) -> list[Entry]:
             pass
     except OSError as error:
         raise InputError(f"{folder}: can't be listed: {error.strerror}") from None
-    cache = _cache_file(folder)
-    found = {_identity(entry): (file, entry) for file, entry in _scan(folder)}
-    cached = _read_cache(cache)
-    kept = [entry for entry in cached if found.pop(_identity(entry), None)]
-    new = [
-        entry if entry["problem"] else entry_of(file, *_identity(entry))
-        for file, entry in found.values()
-    ]
-    finished = [entry for entry in new if entry["state"] == "finished"]
-    if finished or len(kept) < len(cached):
-        _write_cache(cache, [*kept, *finished])
-    return sorted([*kept, *new], key=lambda entry: entry["path"])
+    return sorted(_scan(folder), key=lambda entry: entry["path"])
 
 
-def _identity(entry: Entry) -> tuple[str, int, int]:
-    return entry["path"], entry["size_bytes"], entry["mtime_ns"]
-
-
-def _cache_file(folder: Path) -> Path | None:
-    """Return the cache file of a folder; None if this user has no home."""
-    given = Path(os.environ.get("XDG_CACHE_HOME", ""))
-    try:
-        place = given if given.is_absolute() else Path.home() / ".cache"
-    except RuntimeError:
-        return None
-    key = f"{_CACHE_VERSION} {_CREATE} ".encode() + os.fsencode(folder)
-    return place / "hilctl" / f"recordings-{hashlib.sha256(key).hexdigest()[:32]}.json"
-
-
-def _read_cache(path: Path | None) -> list[Entry]:
-    """Return the entries in a cache; none if it is missing or damaged."""
-    try:
-        found: list[Entry] = json.loads(path.read_bytes()) if path else []
-    except (OSError, ValueError):
-        return []
-    return found
-
-
-def _write_cache(path: Path | None, entries: Sequence[Entry]) -> None:
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(mode=0o700, parents=True, exist_ok=True)
-        write_text(path, json.dumps(entries), overwrite=True)
-    except (OSError, InputError) as error:
-        _log.warning("cannot write the cache, recordings are read again next time: %s", error)
-
-
-def _scan(folder: Path) -> Iterator[tuple[Path, Entry]]:
-    """Yield each possible recording and its entry, with its problem if it cannot be one.
+def _scan(folder: Path) -> Iterator[Entry]:
+    """Yield the entry of each possible recording, with its problem if it cannot be one.
 
     Links to folders are not followed, to avoid cycles.
     """
@@ -242,13 +189,12 @@ def _scan(folder: Path) -> Iterator[tuple[Path, Entry]]:
             try:
                 status = file.stat()
             except OSError as error:
-                yield file, unreadable(path, 0, 0, f"can't be read: {error.strerror}")
+                yield unreadable(path, 0, 0, f"can't be read: {error.strerror}")
                 continue
-            problem = "" if stat.S_ISREG(status.st_mode) else "is not a file"
-            yield file, unreadable(path, status.st_size, status.st_mtime_ns, problem)
+            yield entry_of(file, path, status.st_size, status.st_mtime_ns)
     for each in unlisted:
         file, problem = Path(each.filename), f"can't be listed: {each.strerror}"
-        yield file, unreadable(f"{_printable_path(file, folder)}/", 0, 0, problem)
+        yield unreadable(f"{_printable_path(file, folder)}/", 0, 0, problem)
 
 
 def _printable_path(file: Path, folder: Path) -> str:
@@ -264,10 +210,6 @@ def unreadable(path: str, size_bytes: int, mtime_ns: int, problem: str) -> Entry
 
 def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
     """Return the entry of a file by both its ends; ``path`` is its name in the catalogue."""
-    # A cached catalogue does not need these imports, which take a second.
-    from hilctl.recording.run_summary import read_ends
-    from hilctl.recording.validation import labels_of, segments_of
-
     entry = unreadable(path, size_bytes, mtime_ns, "")
     try:
         ends = read_ends(file)
@@ -292,7 +234,7 @@ def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
     return entry
 
 
-def _of_segments(segments: "Sequence[Segment]", sample_rate_hz: float | None) -> Mapping[str, Any]:
+def _of_segments(segments: Sequence[Segment], sample_rate_hz: float | None) -> Mapping[str, Any]:
     periods = [segment.period for segment in segments if segment.period > 0.0]
     fastest_hz = sample_rate_hz / min(periods) if sample_rate_hz and periods else None
     text = segments[0].label if segments else None

@@ -9,7 +9,6 @@ from pathlib import Path
 import pytest
 from mcap.writer import Writer
 
-from hilctl.analysis import catalogue
 from hilctl.analysis.catalogue import COLUMNS, entry_of, read_catalogue, select, unreadable
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
@@ -22,29 +21,14 @@ NAMES = ["piezo_compensated", "terfenol_compensated", "terfenol_uncompensated"]
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    """Return a folder of recordings; the cache is this test's own."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def folder(tmp_path):
+    """Return a folder of recordings."""
     made = tmp_path / "recordings"
     made.mkdir()
     for number, name in enumerate(NAMES):
         (made / f"day {number}").mkdir()
         shutil.copy(GOLDEN / f"{name}.mcap", made / f"day {number}" / "run.mcap")
     return made
-
-
-@pytest.fixture
-def entries_read(monkeypatch):
-    """Paths that were read, and not taken from the cache."""
-    paths = []
-    entry_of = catalogue.entry_of
-
-    def counted(file, path, size_bytes, mtime_ns):
-        paths.append(path)
-        return entry_of(file, path, size_bytes, mtime_ns)
-
-    monkeypatch.setattr(catalogue, "entry_of", counted)
-    return paths
 
 
 def paths_of(entries):
@@ -55,39 +39,10 @@ def states_of(entries):
     return {entry["path"]: entry["state"] for entry in entries}
 
 
-def test_a_finished_recording_is_read_once(folder, entries_read):
-    first = read_catalogue(folder)
-    assert paths_of(first) == [f"day {k}/run.mcap" for k in range(3)]
-    assert sorted(entries_read) == paths_of(first)
-    del entries_read[:]
-    assert read_catalogue(folder) == first
-    assert entries_read == []
-
-
 OTHER = GOLDEN / f"{NAMES[0]}.mcap"
 
 
-@pytest.mark.parametrize(("change", "paths", "count"), [
-    (lambda run: os.utime(run, ns=(1, 1)), ["day 1/run.mcap"], 3),
-    (lambda run: shutil.copy(OTHER, run), ["day 1/run.mcap"], 3),
-    (lambda run: run.rename(run.with_name("other.mcap")), ["day 1/other.mcap"], 3),
-    (lambda run: run.unlink(), [], 2),
-    (lambda run: shutil.copy(OTHER, run.parents[1] / "a.mcap"), ["a.mcap"], 4),
-], ids=["newer", "larger", "moved", "gone", "new"])  # fmt: skip
-def test_what_has_changed_is_read_again(folder, entries_read, change, paths, count):
-    read_catalogue(folder)
-    change(folder / "day 1" / "run.mcap")
-    del entries_read[:]
-    fresh = read_catalogue(folder)
-    assert entries_read == paths
-    assert paths_of(fresh) == sorted(paths_of(fresh))
-    assert len(fresh) == count
-    del entries_read[:]
-    assert read_catalogue(folder) == fresh
-    assert entries_read == []
-
-
-def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
+def test_what_can_not_be_read_is_listed_and_listed(folder):
     whole = OTHER.read_bytes()
     torn = folder / "torn.mcap"
     torn.write_bytes(whole[:-100])
@@ -113,32 +68,6 @@ def test_what_can_not_be_read_is_listed_and_looked_at_anew(folder):
     assert states_of(read_catalogue(folder))["torn.mcap"] == "unfinished"
     torn.write_bytes(whole)
     assert states_of(read_catalogue(folder))["torn.mcap"] == "finished"
-
-
-@pytest.mark.parametrize("damage", [b"", b"\xff", "half"])
-def test_a_damaged_cache_is_rebuilt(folder, entries_read, damage):
-    first = read_catalogue(folder)
-    (cache,) = (folder.parent / "cache" / "hilctl").iterdir()
-    whole = cache.read_bytes()
-    assert cache.parent.stat().st_mode & 0o077 == 0
-    cache.write_bytes(whole[: len(whole) // 2] if damage == "half" else damage)
-    del entries_read[:]
-    assert read_catalogue(folder) == first
-    assert len(entries_read) == 3
-    assert cache.read_bytes() == whole
-
-
-def test_a_relative_cache_folder_is_ignored(folder, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", "relative")
-    monkeypatch.setenv("HOME", str(folder.parent))
-    read_catalogue(folder)
-    assert len([*(folder.parent / ".cache" / "hilctl").iterdir()]) == 1
-
-
-def test_a_cache_that_cannot_be_written_is_a_warning(folder, monkeypatch, caplog):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(folder / "day 0" / "run.mcap"))
-    assert len(read_catalogue(folder)) == 3
-    assert len(caplog.records) == 1
 
 
 @pytest.mark.parametrize(("where", "days"), [

@@ -12,11 +12,6 @@ from hilctl.run.run_folder import base_folder
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
 
 
-@pytest.fixture(autouse=True)
-def own_cache(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
-
-
 @pytest.fixture
 def folder(tmp_path):
     """Three runs, one with control characters, and an invalid file."""

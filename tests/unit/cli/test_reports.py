@@ -40,9 +40,8 @@ def test_different_replay_has_exit_code_1(recording, monkeypatch, hilctl):
     assert hilctl("replay", recording)[0] == 1
 
 
-def test_all_recordings_of_a_folder_are_exported(tmp_path, monkeypatch, hilctl, json_of):
+def test_all_recordings_of_a_folder_are_exported(tmp_path, hilctl, json_of):
     """Exit code 1 if a file is not exported."""
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     folder = Path(shutil.copytree(GOLDEN, tmp_path / "recordings"))
     words = ("export", folder, tmp_path / "out", "--all")
     assert "3 recordings written" in hilctl(*words)[1]
