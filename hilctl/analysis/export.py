@@ -11,7 +11,7 @@ from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
 from pathlib import Path
-from tempfile import TemporaryFile
+from tempfile import TemporaryDirectory
 from typing import BinaryIO
 from urllib.parse import quote
 
@@ -71,8 +71,9 @@ def export(
 
     def write(stream: BinaryIO) -> None:
         nonlocal rows
-        with TemporaryFile(dir=path.parent) as aside:  # on the same file system
-            rows = write_pieces(pieces, begin(stream, aside))
+        # On the same file system.
+        with TemporaryDirectory(dir=path.parent, ignore_cleanup_errors=True) as aside:
+            rows = write_pieces(pieces, begin(stream, Path(aside)))
 
     write_file(path, write, overwrite=overwrite)
     return rows

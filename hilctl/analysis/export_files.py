@@ -1,15 +1,13 @@
 """Writers of column files: CSV, NumPy, Parquet, MATLAB.
 
-They keep one piece in memory. For formats that need whole columns, or their length first, columns
-are stored in a temporary file.
+They keep one piece in memory. For formats that need whole columns, those are collected in temporary
+files.
 """
 
-import struct
-import zipfile
 from base64 import b64encode
 from collections.abc import Callable, Mapping
-from io import BytesIO
-from typing import IO, Any, BinaryIO, Protocol, TypeAlias
+from pathlib import Path
+from typing import Any, BinaryIO, Protocol, TypeAlias
 
 import numpy as np
 
@@ -23,9 +21,6 @@ _GROUP_ROWS = 2**20  # as pyarrow has it
 _BATCH_ROWS = 2**16  # encoded together; a page has as many or twice that
 _WRITTEN_BYTES = 2**21  # per write: Arrow waits for the interpreter at each one
 _LARGEST_MAT_BYTES = 2**31 - 1  # per variable in this version of the format
-_MAT_HEADER_BYTES = 128
-_MATRIX, _DIMENSIONS, _NAME, _FLAGS = 14, 5, 1, 6
-_MAT_KINDS = {"int64": (14, 12), "float64": (6, 9), "uint32": (13, 6)}
 
 
 class ColumnFile(Protocol):
@@ -43,7 +38,7 @@ class ColumnFile(Protocol):
 class CsvFile:
     """CSV file, without facts."""
 
-    def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
+    def __init__(self, stream: BinaryIO, aside: Path | None = None) -> None:
         self._stream = stream
         self._line = ""
 
@@ -94,7 +89,7 @@ class ParquetFile:
     Columns may be of NumPy or Arrow.
     """
 
-    def __init__(self, stream: BinaryIO, aside: IO[bytes] | None = None) -> None:
+    def __init__(self, stream: BinaryIO, aside: Path | None = None) -> None:
         self._pa = arrow()
         file = self._pa.PythonFile(_RefusedOnce(stream), mode="w")
         self._stream = self._pa.BufferedOutputStream(file, _WRITTEN_BYTES)
@@ -167,26 +162,25 @@ class ParquetFile:
 
 
 class _StoredColumns:
-    """Columns in a temporary file, one piece after the other."""
+    """Columns in one file each of the folder ``aside``."""
 
-    def __init__(self, stream: BinaryIO, aside: IO[bytes]) -> None:
+    def __init__(self, stream: BinaryIO, aside: Path) -> None:
         self._stream, self._aside = stream, aside
-        self._parts: dict[str, list[tuple[int, int]]] = {}
         self._kinds: dict[str, np.dtype[Any]] = {}
         self._rows = 0
 
     def add(self, columns: Columns) -> None:
+        """Store rows."""
         for name, values in columns.items():
             self._kinds[name] = values.dtype
-            self._parts.setdefault(name, []).append((self._aside.tell(), values.nbytes))
-            self._aside.write(np.ascontiguousarray(values).data)
+            with (self._aside / name).open("ab") as file:
+                values.tofile(file)
         self._rows += next(iter(columns.values())).size
 
-    def _copy(self, name: str, target: IO[bytes]) -> None:
-        """Write a column."""
-        for start, size in self._parts[name]:
-            self._aside.seek(start)
-            target.write(self._aside.read(size))
+    def _joined(self) -> dict[str, Any]:
+        """Return the columns, mapped."""
+        kinds = self._kinds.items()
+        return {name: np.memmap(self._aside / name, kind, "r") for name, kind in kinds}
 
 
 class NpzFile(_StoredColumns):
@@ -194,16 +188,8 @@ class NpzFile(_StoredColumns):
 
     def finish(self, facts: Facts) -> None:
         """Write the archive."""
-        with zipfile.ZipFile(self._stream, "w") as archive:
-            for name, kind in self._kinds.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                    descr = np.lib.format.dtype_to_descr(kind)
-                    head = {"descr": descr, "fortran_order": False, "shape": (self._rows,)}
-                    np.lib.format.write_array_header_1_0(entry, head)
-                    self._copy(name, entry)
-            for name, text in facts.items():
-                with archive.open(f"{name}.npy", "w", force_zip64=True) as entry:
-                    np.lib.format.write_array(entry, np.array(text), allow_pickle=False)
+        arrays: dict[str, Any] = {**self._joined(), **facts}
+        np.savez(self._stream, **arrays)
 
 
 class MatFile(_StoredColumns):
@@ -219,41 +205,11 @@ class MatFile(_StoredColumns):
             )
 
     def finish(self, facts: Facts) -> None:
-        """Write the file as SciPy does, which needs twice the memory of each column."""
-        self._stream.write(_saved({})[:_MAT_HEADER_BYTES])
-        for name, kind in self._kinds.items():
-            self._stream.write(_mat_head(name, kind, self._rows))
-            self._copy(name, self._stream)
-            self._stream.write(bytes(-kind.itemsize * self._rows % 8))
-        self._stream.write(_saved(facts)[_MAT_HEADER_BYTES:])
+        """Write the file; each column is copied to memory in turn."""
+        from scipy.io import savemat
 
-
-def _saved(facts: Facts) -> bytes:
-    from scipy.io import savemat
-
-    target = BytesIO()
-    stream: Any = target  # the stubs know only paths
-    savemat(stream, dict(facts), oned_as="column")
-    return target.getvalue()
-
-
-def _mat_head(name: str, kind: np.dtype[Any], rows: int) -> bytes:
-    """Return the header of a column vector.
-
-    Source: MAT-File Format, The MathWorks, version 5: a matrix has flags with its class,
-    dimensions, name and numbers; each starts with its kind and size, and is padded to 8 bytes.
-    """
-    matrix_class, number_kind = _MAT_KINDS[kind.name]
-    size = kind.itemsize * rows
-    text = name.encode()
-    small = len(text) <= 4
-    named = struct.pack("<HH4s" if small else "<II", _NAME, len(text), *([text] if small else []))
-    if not small:
-        named += text + bytes(-len(text) % 8)
-    inside = struct.pack("<IIII", _FLAGS, 8, matrix_class, 0)
-    inside += struct.pack("<IIii", _DIMENSIONS, 8, rows, 1) + named
-    inside += struct.pack("<II", number_kind, size)
-    return struct.pack("<II", _MATRIX, len(inside) + size + -size % 8) + inside
+        stream: Any = self._stream  # the stubs know only paths
+        savemat(stream, {**self._joined(), **facts}, oned_as="column")
 
 
 def arrow() -> Any:
@@ -267,7 +223,7 @@ def arrow() -> Any:
     return pa
 
 
-FORMATS: dict[str, Callable[[BinaryIO, IO[bytes]], ColumnFile]] = {
+FORMATS: dict[str, Callable[[BinaryIO, Path], ColumnFile]] = {
     ".csv": CsvFile,
     ".npz": NpzFile,
     ".parquet": ParquetFile,

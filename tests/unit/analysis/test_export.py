@@ -210,8 +210,7 @@ GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
 
 
 @pytest.fixture
-def folder(tmp_path, monkeypatch):
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
+def folder(tmp_path):
     return Path(shutil.copytree(GOLDEN, tmp_path / "recordings"))
 
 
@@ -288,7 +287,6 @@ def test_a_disk_that_refuses_leaves_nothing_half_written(folder, tmp_path, monke
         exported(folder, tmp_path / "out")
     assert files(tmp_path / "out") == {}
     monkeypatch.undo()
-    monkeypatch.setenv("XDG_CACHE_HOME", str(tmp_path / "cache"))
     assert exported(folder, tmp_path / "out") == (3, 0, {})
 
 
