@@ -10,7 +10,7 @@ from pydantic import TypeAdapter, ValidationError
 
 from hilctl.analysis import tick_lateness
 from hilctl.analysis.run_metrics import RunReport, SegmentReport
-from hilctl.analysis.segment_metrics import SegmentReportBuilder
+from hilctl.analysis.segment_report import SegmentReportBuilder
 from hilctl.analysis.steady_state import judged
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, CHANGES, LOST_READINGS, MARK, Event

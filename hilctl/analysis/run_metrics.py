@@ -3,12 +3,11 @@
 A metric without meaning is None: an average without a period, an error without a reference.
 """
 
-import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from typing import Any
 
-from hilctl.base.formatting import shown_briefly
+from hilctl.base.formatting import finite, shown_briefly
 from hilctl.base.types import CommandUnit
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import LabelValue
@@ -144,16 +143,5 @@ class RunReport(RunMetrics):
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values for JSON; numbers that are not finite become None."""
-        mapping: dict[str, Any] = without_infinity(asdict(self))
+        mapping: dict[str, Any] = finite(asdict(self))
         return mapping
-
-
-def without_infinity(value: Any) -> Any:
-    """Return plain values with None for numbers that JSON does not have."""
-    if isinstance(value, dict):
-        return {key: without_infinity(inner) for key, inner in value.items()}
-    if isinstance(value, list | tuple):
-        return [without_infinity(inner) for inner in value]
-    if isinstance(value, float) and not math.isfinite(value):
-        return None
-    return value

@@ -15,14 +15,8 @@ from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64
 from hilctl.live.traces import ROW, Traces
 from hilctl.run.metadata import LimitBounds, RunDescription
-from hilctl.signals.cycle_metrics import (
-    CycleAverager,
-    noise_floor_percent,
-    peak_and_rms_percent,
-    peak_hysteresis_percent,
-    peak_to_peak,
-    sensor_noise_um,
-)
+from hilctl.signals.cycle_metrics import sensor_noise_um
+from hilctl.signals.segment_metrics import SegmentMetrics
 
 WARNING_USED, ERROR_USED = 0.8, 0.95
 """Used fractions of a limit above which a gauge is a warning or an error."""
@@ -149,6 +143,7 @@ class RunningFigures:
 
     def __init__(self, sample_rate_hz: float, loop_input: str) -> None:
         self._rate_hz, self._input = sample_rate_hz, ROW[loop_input]
+        self._compensated = loop_input == "reference"
         self._segment: Segment | None = None
         self._group: _Group | None = None
         self.newest: FigureValues = {}
@@ -174,78 +169,40 @@ class RunningFigures:
         """Return the next group: complete cycles from the start of a cycle."""
         if segment.period <= 0.0:
             start = max(sample, segment.start)
-            return _Group(start, start + max(1, round(_GROUP_S * self._rate_hz)), segment)
+            stop = start + max(1, round(_GROUP_S * self._rate_hz))
+            return _Group(start, stop, segment, compensated=self._compensated)
         cycles = max(1, round(_GROUP_S * self._rate_hz / segment.period))
         passed = math.ceil(max(0, sample - segment.start) / segment.period - 1e-9)
         start = segment.start + math.ceil(passed * segment.period - 1e-9)
         stop = segment.start + math.ceil((passed + cycles) * segment.period - 1e-9)
-        return _Group(start, stop, segment)
+        return _Group(start, stop, segment, compensated=self._compensated)
 
 
 class _Group:
     """Consecutive cycles of a segment: the samples in [start, stop)."""
 
-    def __init__(self, start: int, stop: int, segment: Segment) -> None:
+    def __init__(self, start: int, stop: int, segment: Segment, *, compensated: bool) -> None:
         self.start, self.stop = start, stop
-        self._origin, period, self._is_loop = segment.start, segment.period, segment.is_loop
-        self._folding = CycleAverager(period, 2) if period > 0.0 else None
-        self._peak_um = self._squares_um2 = 0.0
-        self._low_um, self._high_um = math.inf, -math.inf
-        self._errors = 0
+        averaged = segment.period > 0.0
+        self._metrics = SegmentMetrics(segment, averaged=averaged, compensated=compensated)
         self._index: I64 = np.empty(0, dtype=np.int64)
         self._displacement_um: F64 = np.empty(0)
 
     def add(self, traces: Traces, loop_input: int) -> None:
         """Add samples; one row is the input of the loop."""
         kept = (traces.flags & _LEFT_OUT) == 0
-        traces = Traces(traces.index[kept], traces.values[:, kept], traces.flags[kept])
-        if not traces.index.size:
-            return
-        displacement_um, error_um = traces.values[ROW["displacement"]], traces.values[ROW["error"]]
-        if self._folding is not None:
-            loop = np.array((traces.values[loop_input], displacement_um))
-            self._folding.add(traces.index - self._origin, loop)
-        error_um = error_um[np.isfinite(error_um)]
-        self._errors += error_um.size
-        self._squares_um2 += float(np.square(error_um).sum())
-        self._peak_um = max(self._peak_um, float(np.abs(error_um).max(initial=0.0)))
-        self._low_um = min(self._low_um, float(np.nanmin(displacement_um, initial=math.inf)))
-        self._high_um = max(self._high_um, float(np.nanmax(displacement_um, initial=-math.inf)))
-        self._index = np.concatenate((self._index, traces.index))[-_NOISE_SAMPLES:]
+        index, displacement_um = traces.index[kept], traces.values[ROW["displacement"], kept]
+        self._metrics.add(index, np.array((traces.values[loop_input, kept], displacement_um)))
+        self._index = np.concatenate((self._index, index))[-_NOISE_SAMPLES:]
         newest_um = np.concatenate((self._displacement_um, displacement_um))
         self._displacement_um = newest_um[-_NOISE_SAMPLES:]
 
     def figures(self) -> FigureValues:
         """Return the metrics; none without a displacement."""
-        if not math.isfinite(self._low_um):
+        if not (raw := self._metrics.raw()):
             return {}
         noise_um = sensor_noise_um(self._index, self._displacement_um)
-        found: FigureValues = {
-            "peak_to_peak_um": self._high_um - self._low_um,
-            "sensor_noise_um": noise_um,
-        }
-        if self._errors:
-            found["peak_error_um"] = self._peak_um
-            found["rms_error_um"] = math.sqrt(self._squares_um2 / self._errors)
-        if self._folding is not None:
-            found |= self._of_cycle(self._folding, noise_um)
-        return found
-
-    def _of_cycle(self, folding: CycleAverager, noise_um: float | None) -> FigureValues:
-        cycle = folding.fold()
-        if not cycle.whole:
-            return {}
-        loop_input, output = cycle.signals
-        stroke_um = peak_to_peak(output)
-        found: FigureValues = {"peak_to_peak_um": stroke_um}
-        if self._is_loop:
-            found["peak_hysteresis_percent"] = peak_hysteresis_percent(loop_input, output)
-        if self._is_loop and noise_um is not None:
-            found["noise_floor_percent"] = noise_floor_percent(noise_um, cycle.counts, stroke_um)
-        if self._errors:
-            errors = peak_and_rms_percent(output - loop_input, peak_to_peak(loop_input))
-            found["peak_error_percent"], found["rms_error_percent"] = errors
-        return found
+        return {"sensor_noise_um": noise_um, **raw, **self._metrics.metrics(noise_um)}
 
 
 class LiveErrorSpectrum:

@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import platform
 import sys
 import uuid
@@ -33,15 +32,7 @@ from hilctl.recording.metadata_keys import (
     OVERRIDES_FACT,
     USAGE_FACT,
 )
-from hilctl.signals.cycle_metrics import (
-    CycleAverager,
-    loop_area,
-    peak,
-    peak_hysteresis_percent,
-    peak_to_peak,
-    percent,
-    rms,
-)
+from hilctl.signals.segment_metrics import SegmentMetrics
 
 if TYPE_CHECKING:
     from hilctl.experiment.load import LoadedExperiment
@@ -253,19 +244,24 @@ class EndFigures:
         self._compensated = compensated
         self._done: list[tuple[Segment, dict[str, float]]] = []
         self._changes: list[Event] = []
-        self._current: _SegmentFigures | None = None
+        self._current: SegmentMetrics | None = None
 
     def add(self, samples: Samples) -> None:
         """Add the next samples of the run."""
         index = samples.index[(samples.flags & NO_WAVEFORM) == 0]
         while self._segments and index.size and self._segments[0].steady_start <= index[-1]:
             segment = self._segments[0]
-            if self._current is None:
-                self._current = _SegmentFigures(segment, compensated=self._compensated)
-            self._current.add(samples)
+            start, stop, cycles = segment.steady_cycles()
+            self._current = self._current or SegmentMetrics(
+                segment, averaged=cycles > 0, compensated=self._compensated
+            )
+            part = samples.part(start, stop)
+            part = part.rows((part.flags & _LEFT_OUT) == 0)
+            loop_input = part.reference_um if self._compensated else part.command
+            self._current.add(part.index, np.array((loop_input, part.displacement_um)))
             if index[-1] + 1 < segment.steady_stop:
                 return
-            self._done.append((segment, self._current.figures()))
+            self._done.append((segment, self._current.metrics()))
             self._current = None
             del self._segments[0]
 
@@ -286,66 +282,3 @@ class EndFigures:
         return bool(changes) and (
             changes[-1].sample + changes[-1].values["samples"] > segment.steady_start
         )
-
-
-class _SegmentFigures:
-    """Metrics of one segment."""
-
-    def __init__(self, segment: Segment, *, compensated: bool) -> None:
-        self._segment, self._compensated = segment, compensated
-        self._start, self._stop, cycles = segment.steady_cycles()
-        self._folding = CycleAverager(segment.period, 2) if cycles else None
-        self._lowest, self._highest = np.full(2, np.inf), np.full(2, -np.inf)  # input, output
-        self._peak_um = self._squares_um2 = 0.0
-        self._samples = 0
-
-    @np.errstate(over="ignore", invalid="ignore")  # of extreme readings
-    def add(self, samples: Samples) -> None:
-        """Add samples; only those in the steady part count."""
-        part = samples.part(self._start, self._stop)
-        part = part.rows((part.flags & _LEFT_OUT) == 0)
-        loop_input = part.reference_um if self._compensated else part.command
-        loop = np.array((loop_input, part.displacement_um))
-        if self._folding:
-            self._folding.add(part.index - self._segment.start, loop)
-            return
-        loop = loop[:, np.isfinite(loop).all(axis=0)]
-        if loop.size:
-            loop_input, output = loop
-            error_um = output - loop_input
-            self._lowest = np.minimum(self._lowest, loop.min(axis=1))
-            self._highest = np.maximum(self._highest, loop.max(axis=1))
-            self._peak_um = max(self._peak_um, float(np.abs(error_um).max()))
-            self._squares_um2 += float(np.square(error_um).sum())
-            self._samples += output.size
-
-    @np.errstate(over="ignore", invalid="ignore")
-    def figures(self) -> dict[str, float]:
-        """Return the metrics by name."""
-        found: dict[str, float | None] = {}
-        if self._folding:
-            cycle = self._folding.fold()
-            if cycle.whole:
-                loop_input, output = cycle.signals
-                error_um = output - loop_input
-                spans = peak_to_peak(loop_input), peak_to_peak(output)
-                found = self._quality(spans, peak(error_um), rms(error_um))
-                if self._segment.is_loop:
-                    found["peak_hysteresis_percent"] = peak_hysteresis_percent(loop_input, output)
-                    found["loop_area"] = loop_area(loop_input, output)
-        elif self._samples:
-            rms_um = math.sqrt(self._squares_um2 / self._samples)
-            wanted_um, stroke_um = (self._highest - self._lowest).tolist()
-            found = self._quality((wanted_um, stroke_um), self._peak_um, rms_um)
-        return {name: value for name, value in found.items() if value is not None}
-
-    def _quality(
-        self, spans: tuple[float, float], peak_um: float, rms_um: float
-    ) -> dict[str, float | None]:
-        """Return metrics; ``spans`` are the peak-to-peaks of the loop's input and output."""
-        wanted_um, stroke_um = spans
-        found: dict[str, float | None] = {"peak_to_peak_um": stroke_um}
-        if self._compensated:
-            found["peak_error_percent"] = percent(peak_um, wanted_um)
-            found["rms_error_percent"] = percent(rms_um, wanted_um)
-        return found

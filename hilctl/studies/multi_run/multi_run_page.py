@@ -7,8 +7,7 @@ from typing import Any
 
 from hilctl.analysis import html
 from hilctl.analysis.html import definitions_of
-from hilctl.analysis.run_metrics import without_infinity
-from hilctl.base.formatting import quantity
+from hilctl.base.formatting import finite, quantity
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.plots import sheets_of
 from hilctl.studies.multi_run.trend import (
@@ -200,5 +199,5 @@ def _run(run: SeriesRun) -> dict[str, Any]:
         "recording": run.recording,
         "started": run.digest.started if run.digest else None,
         "model_error_percent": run.digest.model_error_percent if run.digest else None,
-        **without_infinity(asdict(run.figures)),
+        **finite(asdict(run.figures)),
     }

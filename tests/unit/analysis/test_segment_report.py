@@ -5,8 +5,7 @@ from dataclasses import asdict, replace
 import numpy as np
 import pytest
 
-from hilctl.analysis import quantiles
-from hilctl.analysis.segment_metrics import SegmentReportBuilder
+from hilctl.analysis.segment_report import SegmentReportBuilder
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 
@@ -50,18 +49,6 @@ def test_pieces_give_what_the_whole_gives(recording, period, bounds, compensated
     assert parts == pytest.approx(whole, rel=1e-9)
     assert whole["sensor_noise_um"] == pytest.approx(0.01, rel=0.03)
     assert parts["steady_samples"] == whole["steady_samples"] < N - 1500
-
-
-def test_noise_of_many_samples_is_right_to_its_bins(monkeypatch, recording):
-    segment = Segment("sine", 0, N, 500, N - 500, 500.0)
-    window = (1000, N - 500, 37)
-    exact = figures(recording, segment, window, [])
-    monkeypatch.setattr(quantiles, "MOST_EXACT", 1000)
-    binned = figures(recording, segment, window, range(0, N, 999))
-    for name in ("sensor_noise_um", "noise_floor_percent"):
-        assert binned[name] != exact[name]
-        # Of so few, neighbours lie further apart than a bin is wide.
-        assert binned[name] == pytest.approx(exact[name], rel=2e-4)
 
 
 def test_a_segment_that_was_not_reached_has_none(recording):
