@@ -33,22 +33,30 @@ class CoilHeat:
         self._rate_hz = sample_rate_hz
         self._budget_a2 = (limits.rms_current_a or math.inf) ** 2
         self._tau_s = limits.thermal_time_constant_s
-        self.heat_a2 = self.highest_a2 = heat_a2
+        self._initial_a2 = self.heat_a2 = self.highest_a2 = heat_a2
+        self._hottest_a2 = math.inf
         self._samples = 0
         self._last = 0.0
         self.used_s: float | None = None
 
     def add(self, command: F64) -> None:
         """Add the next commands: float64[n], in A."""
-        if self._tau_s is None:
+        before = self._samples
+        self._samples += command.size
+        if self._tau_s is None or not command.size:
             return
         heat = np.empty(command.size)
         self.heat_a2 = heat_block(command, warming(self._tau_s, self._rate_hz), self.heat_a2, heat)
         over = np.flatnonzero(heat > self._budget_a2)
         if self.used_s is None and over.size:
-            self.used_s = (self._samples + int(over[0])) / self._rate_hz
+            self.used_s = (before + int(over[0])) / self._rate_hz
         self.highest_a2 = max(self.highest_a2, float(heat.max()))
-        self._samples += command.size
+        times_s = np.arange(before + 1, self._samples + 1) / self._rate_hz
+        # The initial heat has decayed long after the start.
+        left = np.maximum(np.exp(-times_s / self._tau_s), 1e-300)
+        alone_a2 = heat - self._initial_a2 * left
+        hottest_a2 = float(np.min((_ROOM * self._budget_a2 - alone_a2) / left))
+        self._hottest_a2 = min(self._hottest_a2, hottest_a2)
 
     def follow(self, samples: Samples) -> None:
         """Add exchanged samples; the output is constant over missing ones."""
@@ -71,17 +79,26 @@ class CoilHeat:
 
     def repeat(self, before_a2: float, samples: int, times: int) -> None:
         """Add the last cycle, begun at ``before_a2``, more times without its highest heat."""
+        # The heat is monotonic over cycles: the first, or the last, still to be added, is highest.
+        self._samples += times * samples
         if self._tau_s is None:
             return
-        self.heat_a2 = _repeated(
-            before_a2, self.heat_a2, samples / self._rate_hz, self._tau_s, times
-        )
-        self._samples += times * samples
+        # A cycle maps the heat before it to kept * heat + a constant: a geometric series.
+        kept = math.exp(-samples / self._rate_hz / self._tau_s)
+        final_a2 = before_a2 + (self.heat_a2 - before_a2) / (1.0 - kept)
+        self.heat_a2 = final_a2 + (before_a2 - final_a2) * kept ** (times + 1)
 
     @property
     def rms_a(self) -> float | None:
         """Highest running rms of the current so far, in A; None without a thermal budget."""
         return None if self._tau_s is None else math.sqrt(self.highest_a2)
+
+    @property
+    def effect(self) -> "RunHeat":
+        """Effect of the commands, whatever the initial heat."""
+        seconds = self._samples / self._rate_hz
+        kept_a2 = cooled(self._initial_a2, 0.0, self._tau_s, seconds)
+        return RunHeat(seconds, max(0.0, self.heat_a2 - kept_a2), self._hottest_a2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -91,34 +108,6 @@ class RunHeat:
     seconds: float = 0.0  # duration of the run
     alone_a2: float = 0.0  # final heat of an initially cold coil, in A^2
     hottest_a2: float = math.inf  # highest initial heat within the budget; infinite without one
-
-    def then(self, command: F64, limits: Limits, sample_rate_hz: float) -> "RunHeat":
-        """Return the effect including the next commands: float64[n], in A."""
-        before = round(self.seconds * sample_rate_hz)
-        seconds = (before + command.size) / sample_rate_hz
-        tau_s = limits.thermal_time_constant_s
-        if tau_s is None or not command.size:
-            return RunHeat(seconds)
-        alone = np.empty(command.size)
-        last = heat_block(command, warming(tau_s, sample_rate_hz), self.alone_a2, alone)
-        times_s = np.arange(before + 1, before + command.size + 1) / sample_rate_hz
-        # The initial heat has decayed long after the start.
-        left = np.maximum(np.exp(-times_s / tau_s), 1e-300)
-        budget_a2 = _ROOM * (limits.rms_current_a or math.inf) ** 2
-        hottest = float(np.min((budget_a2 - alone) / left))
-        return RunHeat(seconds, last, min(self.hottest_a2, hottest))
-
-    def repeated(
-        self, alone_a2: float, samples: int, times: int, limits: Limits, sample_rate_hz: float
-    ) -> "RunHeat":
-        """Return the effect including more repeats of the last cycle, begun at ``alone_a2``."""
-        # The margin is monotonic: the first cycle or the last, still to be added, sets the highest.
-        seconds = self.seconds + times * samples / sample_rate_hz
-        tau_s = limits.thermal_time_constant_s
-        if tau_s is None:
-            return RunHeat(seconds)
-        last = _repeated(alone_a2, self.alone_a2, samples / sample_rate_hz, tau_s, times)
-        return RunHeat(seconds, last, self.hottest_a2)
 
 
 class CoolingCoil:
@@ -149,14 +138,6 @@ class CoolingCoil:
             return 0.0
         allowed_a2 = max(hottest_a2 - self._rest**2, _LEAST_DIFFERENCE * over_a2)
         return max(0.0, self._tau_s * math.log(over_a2 / allowed_a2))
-
-
-def _repeated(before_a2: float, after_a2: float, seconds: float, tau_s: float, times: int) -> float:
-    """Return the heat after ``times`` more repeats of a cycle with known heat before and after."""
-    # A cycle maps the heat before it to kept * heat + a constant: a geometric series.
-    kept = math.exp(-seconds / tau_s)
-    final_a2 = before_a2 + (after_a2 - before_a2) / (1.0 - kept)
-    return final_a2 + (before_a2 - final_a2) * kept ** (times + 1)
 
 
 def cooled(heat_a2: float, held_a: float, tau_s: float | None, seconds: float) -> float:

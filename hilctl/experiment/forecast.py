@@ -95,7 +95,7 @@ def forecast_of(
     heat_a2 = max(heat_a2, config.safe.value**2)
     figures = _RunFigures(config, heat_a2)
     if conditioned.size:
-        figures.add_before(conditioned)
+        figures.command.add(conditioned)
     values = reference.values
     simulate_commands(
         compensator,
@@ -124,7 +124,7 @@ def forecast_of(
         fastest_at_s=fastest_at_s,
         voltage_v=None if config.amplifier is None else command.voltage_v,
         voltage_at_s=voltage_at_s,
-        heat=figures.heat,
+        heat=heat.effect,
         begins_rms_a=None if heat.rms_a is None else math.sqrt(heat_a2),
         heating_rms_a=heat.rms_a,
         budget_used_s=heat.used_s,
@@ -291,33 +291,24 @@ class _RunFigures:
 
     def __init__(self, config: Experiment, heat_a2: float) -> None:
         self.command = CommandFigures(config, config.safe.value, heat_a2)
-        self.heat = RunHeat()
         self.ends = LineEnds()
-        self._limits, self._rate_hz = config.limits, config.sample_rate_hz
         self.first = math.nan
-        self._marked = 0.0, 0.0
-
-    def add_before(self, command: F64) -> None:
-        """Add commands before the waveform: float64[n], n > 0."""
-        self.command.add(command)
-        self.heat = self.heat.then(command, self._limits, self._rate_hz)
+        self._marked_a2 = 0.0
 
     def add(self, reference: F64, command: F64) -> None:
         """Add the next samples: float64[n] each, n > 0."""
         if math.isnan(self.first):
             self.first = float(command[0])
-        self.add_before(command)
+        self.command.add(command)
         self.ends.add(reference, command)
 
     def mark(self) -> None:
         """Mark the start of a cycle."""
-        self._marked = self.command.heat.heat_a2, self.heat.alone_a2
+        self._marked_a2 = self.command.heat.heat_a2
 
     def skip(self, samples: int, times: int) -> None:
         """Add the cycle since the mark, of ``samples`` samples, ``times`` more times."""
-        before_a2, alone_a2 = self._marked
-        self.command.skip(before_a2, samples, times)
-        self.heat = self.heat.repeated(alone_a2, samples, times, self._limits, self._rate_hz)
+        self.command.skip(self._marked_a2, samples, times)
 
 
 class LineEnds:

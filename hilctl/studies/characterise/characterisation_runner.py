@@ -10,7 +10,7 @@ from pathlib import Path
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
 from hilctl.base.files import check_writable, make_folder, write_text
 from hilctl.base.types import F64, CommandUnit
-from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
+from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_before
 from hilctl.experiment.load import load_experiment
 from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
@@ -152,7 +152,9 @@ class CharacterisationRunner:
         return StepRunner(self._host, self.plan.seconds)
 
     def _heat(self, command: F64) -> RunHeat:
-        return RunHeat().then(command, self._loaded.config.limits, self.limits.sample_rate_hz)
+        heat = CoilHeat(self._loaded.config.limits, self.limits.sample_rate_hz, 0.0)
+        heat.add(command)
+        return heat.effect
 
     def discard(self) -> None:
         """Delete the recordings of all steps."""

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.samples import Flag, Samples
-from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, RunHeat, cooled
+from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, cooled
 from hilctl.experiment.load import load_experiment
 from tests.unit.studies.characterise.conftest import experiment
 
@@ -26,11 +26,18 @@ def coil(config):
     return CoolingCoil(config, 0.0, 100.0)
 
 
+def effect(config, parts, heat_a2=0.0):
+    heat = CoilHeat(config.limits, RATE_HZ, heat_a2)
+    for part in parts:
+        heat.add(part)
+    return heat.effect
+
+
 @pytest.fixture
 def held(config):
     def make(amps, seconds):
         command = np.full(round(seconds * RATE_HZ), float(amps))
-        return RunHeat().then(command, config.limits, RATE_HZ)
+        return effect(config, [command])
 
     return make
 
@@ -52,7 +59,7 @@ def samples(index, command, measured=None, flags=None):
 
 def test_without_a_budget_nothing_is_waited_for(experiment):
     config = load_experiment(experiment).config
-    run = RunHeat().then(np.full(25000, 4.0), config.limits, RATE_HZ)
+    run = effect(config, [np.full(25000, 4.0)])
     cold = CoolingCoil(config, 0.0, 0.0)
     cold.ran(run, 5.0)
     assert cold.pause_s(run, 5.0) == 0.0
@@ -73,12 +80,11 @@ def test_the_pause_is_just_long_enough(coil, held, config):
         assert (then.highest_a2 <= 0.901) is kept
 
 
-def test_in_parts_a_run_does_the_same(config):
+@pytest.mark.parametrize("heat_a2", [0.0, 0.5])
+def test_in_parts_and_from_any_heat_a_run_does_the_same(config, heat_a2):
     command = np.sin(np.arange(9000) / 50.0) * 2.0
-    whole = RunHeat().then(command, config.limits, RATE_HZ)
-    parts = RunHeat()
-    for part in np.split(command, 3):
-        parts = parts.then(part, config.limits, RATE_HZ)
+    whole = effect(config, [command])
+    parts = effect(config, np.split(command, 3), heat_a2)
     assert parts.seconds == pytest.approx(whole.seconds)
     assert parts.alone_a2 == pytest.approx(whole.alone_a2, rel=1e-12)
     assert parts.hottest_a2 == pytest.approx(whole.hottest_a2, rel=1e-9)
