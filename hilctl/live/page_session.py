@@ -21,7 +21,6 @@ MAX_MESSAGE_BYTES = 4096
 """Largest message of a page."""
 SLOW_S = 5.0
 """A page that reads nothing for this time is disconnected."""
-_RATE_HZ, _BURST = 20.0, 40.0
 
 
 class PageView(StrictModel):
@@ -50,24 +49,6 @@ def answer_text(message: PageMessage, **values: Any) -> str:
     return finite_json({"kind": "answer", "id": message.id, "ask": message.ask, **values})
 
 
-class RateLimiter:
-    """Rate limiter: ``rate_hz`` in the long run, at most ``burst`` at one time."""
-
-    def __init__(self, rate_hz: float, burst: float, clock: Callable[[], float]) -> None:
-        self._rate_hz, self._burst, self._clock = rate_hz, burst, clock
-        self._left, self._at = burst, clock()
-
-    def take(self) -> bool:
-        """Return whether one more is allowed now, and count it."""
-        now = self._clock()
-        self._left = min(self._burst, self._left + (now - self._at) * self._rate_hz)
-        self._at = now
-        if self._left < 1.0:
-            return False
-        self._left -= 1.0
-        return True
-
-
 class PageSession:
     """Session of an authenticated page; ``answer`` executes a request and returns its answer."""
 
@@ -79,7 +60,6 @@ class PageSession:
     ) -> None:
         self.view = PageView()
         self._connection, self._answer, self._clock = connection, answer, clock
-        self._limiter = RateLimiter(_RATE_HZ, _BURST, clock)
         self._sending: asyncio.Task[None] | None = None
         self._began_s = 0.0
 
@@ -107,9 +87,6 @@ class PageSession:
     async def serve(self) -> None:
         """Execute the requests of the page until it disconnects."""
         async for raw in self._connection:
-            if not self._limiter.take():
-                await self._connection.close(1008, "too many messages")
-                return
             try:
                 message = PageMessage.model_validate_json(raw)
             except ValidationError:

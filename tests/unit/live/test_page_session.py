@@ -6,7 +6,7 @@ from unittest.mock import Mock
 
 import pytest
 
-from hilctl.live.page_session import SLOW_S, PageSession, PageView, RateLimiter
+from hilctl.live.page_session import SLOW_S, PageSession, PageView
 from tests.fakes import SteppingClock
 
 
@@ -79,20 +79,6 @@ def test_invalid_window_is_refused_without_effect(value):
     assert (refused["kind"], refused["id"], refused["ok"]) == ("answer", 5, False)
     assert refused["error"].startswith("window_s: ")
     assert connection.sent[1] == "6 stop"
-
-
-def test_too_many_messages_end_the_connection():
-    _, connection = served(*[message()] * 500)
-    assert connection.closed == (1008, "too many messages")
-    assert len(connection.sent) == 40
-
-
-def test_rate_limiter_refills():
-    clock = SteppingClock()
-    limiter = RateLimiter(2.0, 3.0, clock)
-    assert [limiter.take() for _ in range(4)] == [True, True, True, False]
-    clock.now = 1.0
-    assert [limiter.take() for _ in range(3)] == [True, True, False]
 
 
 def test_slow_page_gets_the_newest_frame_and_is_disconnected():
