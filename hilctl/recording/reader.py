@@ -1,6 +1,7 @@
 """Reading of MCAP files, whole or in pieces."""
 
 import logging
+from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
@@ -34,31 +35,6 @@ from hilctl.recording.validation import (
 _TEXTS = {"experiment.yaml", "model.yaml", "correction.yaml"}
 _NUMBER_BYTES = 8
 _EVENT_BYTES = 2048  # Python objects per message
-_MOST_LOOSE = 512
-
-
-class ColumnTable:
-    """Growing columns; small blocks are joined because every array has an overhead of 100 bytes."""
-
-    def __init__(self) -> None:
-        self._joined: dict[str, list[Any]] = {}
-        self._loose: dict[str, list[Any]] = {}
-        self._added = 0
-
-    def add(self, columns: Mapping[str, Any]) -> None:
-        """Append rows."""
-        for name, values in columns.items():
-            self._loose.setdefault(name, []).append(values)
-        self._added += 1
-        if self._added % _MOST_LOOSE == 0:
-            for name, parts in self._loose.items():
-                self._joined.setdefault(name, []).append(np.concatenate(parts))
-            self._loose = {}
-
-    def pop(self, name: str, kind: Any = np.float64) -> Any:
-        """Remove a column and return its values; an empty array if it is missing."""
-        parts = [*self._joined.pop(name, []), *self._loose.pop(name, [])]
-        return np.concatenate(parts).astype(kind, copy=False) if parts else np.empty(0, dtype=kind)
 
 
 class RecordingBuilder:
@@ -81,7 +57,7 @@ class RecordingBuilder:
     def _begin(self) -> None:
         """Start a piece."""
         self.waiting = 0
-        self._blocks, self._ticks = ColumnTable(), ColumnTable()
+        self._columns: dict[str, list[Any]] = defaultdict(list)
         self._starts: list[ReplayStart] = []
         self._events: list[tuple[int, Any]] = []
 
@@ -127,7 +103,7 @@ class RecordingBuilder:
             self._block(decoded)
         elif topic == "/ticks" and self._within(*_reach(decoded)):
             self._budget.keep(_NUMBER_BYTES * decoded.late_ns.size * len(TICK_COLUMNS))
-            self._ticks.add({name: getattr(decoded, name) for name in TICK_COLUMNS})
+            self._add({name: getattr(decoded, name) for name in TICK_COLUMNS})
         elif topic == "/events":
             self._budget.keep(_EVENT_BYTES + len(record.data))
             self._events.append((record.log_time, decoded))
@@ -153,10 +129,19 @@ class RecordingBuilder:
         self.samples += block.n
         self.waiting += block.n
         index = np.arange(block.tick0, block.tick0 + block.n)
-        self._blocks.add({"index": index, "flags": block.flags, **block.columns})
+        self._add({"index": index, "flags": block.flags, **block.columns})
         for previous in block.previous_command.tolist():
             self._budget.keep(_EVENT_BYTES + _NUMBER_BYTES * block.state.size)
             self._starts.append(ReplayStart(block.tick0, block.state.copy(), previous))
+
+    def _add(self, columns: Mapping[str, Any]) -> None:
+        for name, values in columns.items():
+            self._columns[name].append(values)
+
+    def _pop(self, name: str, kind: Any = np.float64) -> Any:
+        """Remove a column and return its values; an empty array if it is missing."""
+        parts = self._columns.pop(name, [])
+        return np.concatenate(parts).astype(kind, copy=False) if parts else np.empty(0, dtype=kind)
 
     def piece(self, path: Path, *, last: bool = False) -> Recording:
         """Return everything taken since the last piece; the last one has the end of the run."""
@@ -184,7 +169,7 @@ class RecordingBuilder:
             end=self._end if last else {},
             samples=self._blocks_of(unit),
             dropped=max(gaps, count_of(self._end, "missing_samples")) if last else 0,
-            ticks=Ticks(**{name: self._ticks.pop(name, np.int64) for name in TICK_COLUMNS}),
+            ticks=Ticks(**{name: self._pop(name, np.int64) for name in TICK_COLUMNS}),
             events=tuple(_event(time_ns, each, unit) for time_ns, each in self._events),
             starts=tuple(self._starts),
         )
@@ -209,8 +194,8 @@ class RecordingBuilder:
         }
 
     def _blocks_of(self, unit: CommandUnit) -> Samples:
-        index, flags = self._blocks.pop("index", np.int64), self._blocks.pop("flags", np.uint32)
-        samples = _samples(index, flags, unit, self._blocks.pop)
+        index, flags = self._pop("index", np.int64), self._pop("flags", np.uint32)
+        samples = _samples(index, flags, unit, self._pop)
         if samples.index.size:
             recorded = {name for name, values in samples.columns().items() if values.size}
             if recorded != (self._recorded or recorded):

@@ -16,7 +16,7 @@ from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, BlockHeader
 from hilctl.recording import reader
-from hilctl.recording.reader import ColumnTable, RecordingStream, read
+from hilctl.recording.reader import RecordingStream, read
 from hilctl.recording.recording import TICK_COLUMNS
 from hilctl.recording.time_range import TimeRange
 from tests.unit.recording.conftest import same_samples, written
@@ -159,16 +159,6 @@ def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, seven_blocks):
     assert threading.active_count() == before
     assert streams
     assert all(stream.closed for stream in streams)
-
-
-def test_many_small_blocks_take_no_array_each():
-    table = ColumnTable()
-    for number in range(2000):
-        table.add({"a": np.array([number])} | ({"b": np.array([number])} if number % 7 else {}))
-        assert len(table._loose.get("a", [])) < 512
-    assert table.pop("a", np.int64).tolist() == list(range(2000))
-    assert table.pop("b", np.int64).tolist() == [n for n in range(2000) if n % 7]
-    assert table.pop("a", np.int64).size == 0
 
 
 def test_a_walk_can_be_repeated(seven_blocks):
