@@ -1,7 +1,7 @@
 """Segments of a run: its waveforms and their steady cycles, which metrics are computed on."""
 
 from dataclasses import asdict, dataclass, replace
-from typing import Any, Self
+from typing import Any
 
 SHORTEST_PERIOD = 1.0
 """Shortest period of a waveform in samples."""
@@ -64,8 +64,3 @@ class Segment:
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values, for a recording's metadata."""
         return asdict(self)
-
-    @classmethod
-    def from_mapping(cls, mapping: dict[str, Any]) -> Self:
-        """Return the segment from :meth:`to_mapping`."""
-        return cls(**mapping)

@@ -165,7 +165,7 @@ class RunDescription(StrictModel):
     waveform_unit: str
     compensator: str
     samples: int
-    segments: list[dict[str, Any]]  # as Segment.to_mapping, from the waveform's first sample
+    segments: list[Segment]  # from the waveform's first sample
     limits: LimitBounds
     settings: list[SettingRow]
 
@@ -186,14 +186,14 @@ class RunDescription(StrictModel):
             waveform_unit=reference.unit,
             compensator=str(getattr(loaded.model, "kind", "")),
             samples=int(reference.values.size),
-            segments=[each.to_mapping() for each in reference.segments],
+            segments=list(reference.segments),
             limits=_limits(checked),
             settings=setting_rows(loaded.document.data),
         )
 
     def segments_at(self, waveform_at: int) -> list[Segment]:
         """Return the segments of a run whose waveform begins at sample ``waveform_at``."""
-        return [Segment.from_mapping(each).shifted(waveform_at) for each in self.segments]
+        return [each.shifted(waveform_at) for each in self.segments]
 
     def write(self, path: Path) -> None:
         """Write the description as JSON."""

@@ -22,7 +22,7 @@ import struct
 import sys
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass, fields
+from dataclasses import asdict, dataclass
 from functools import cache
 from pathlib import Path
 from typing import Any, Self
@@ -40,7 +40,6 @@ _SUPERVISOR = "supervisor.lock"
 _DEVICES = "devices"
 _REMOVED = " (deleted)"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
-_LATEST_S = 1e12
 _BACKLOG = 1000  # connections that query the holder of a device; never accepted
 
 
@@ -57,22 +56,9 @@ class RunCard:
 
     @classmethod
     def from_json(cls, text: str) -> Self:
-        """Return a card; a text that is not a card raises ValueError."""
-        values = json.loads(text)
-        if not isinstance(values, dict):
-            raise ValueError("must be an object")  # noqa: TRY004, see Raises
-        values = {"holds": [], **values}
-        kinds = {"supervisor": int, "started": int | float, "holds": list}
-        for name in [each.name for each in fields(cls)]:
-            value, kind = values.get(name), kinds.get(name, str)
-            if not isinstance(value, kind) or isinstance(value, bool):
-                raise ValueError(f"{name} must not be {value!r}")  # noqa: TRY004, see Raises
-        if not (0 <= values["started"] < _LATEST_S and 0 < values["supervisor"] < 2**31):
-            raise ValueError("started or supervisor is out of range")
-        return cls(
-            **{each.name: values[each.name] for each in fields(cls)}
-            | {"holds": tuple(map(str, values["holds"]))}
-        )
+        """Return a card; raise ValueError or TypeError if a text is not one."""
+        values = {"holds": [], **json.loads(text)}
+        return cls(**values | {"holds": tuple(values["holds"])})
 
 
 @dataclass(frozen=True, slots=True)
@@ -195,7 +181,7 @@ def runs() -> list[RunFolder]:
             try:
                 if text:  # empty after the end of a run
                     found.append(RunFolder(path.parent, RunCard.from_json(text)))
-            except (ValueError, RecursionError) as error:
+            except (ValueError, TypeError) as error:
                 _warn_once(path.parent.name, f"{path}: {error}")
     return sorted(found, key=lambda run: run.card.started)
 

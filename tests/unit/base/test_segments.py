@@ -54,7 +54,7 @@ def test_shifted() -> None:
 def test_mapping_goes_through_json() -> None:
     original = Segment("complex harmonic 4 um 20 Hz", 7, 12345, 100, 12000, 50e3 / 3.0)
     text = json.dumps(original.to_mapping())
-    assert Segment.from_mapping(json.loads(text)) == original
+    assert Segment(**json.loads(text)) == original
 
 
 @pytest.mark.parametrize(

@@ -230,7 +230,7 @@ GOOD = Segment("sine", 0, 100, 10, 90, 20.0).to_mapping()
     ],
 )  # fmt: skip
 def test_segments_that_can_not_be(change):
-    assert validation.segments_of(json.dumps([GOOD])) == (Segment.from_mapping(GOOD),)
+    assert validation.segments_of(json.dumps([GOOD])) == (Segment(**GOOD),)
     with pytest.raises(ValueError, match="segments: "):
         validation.segments_of(json.dumps([{**GOOD, **change}]))
 

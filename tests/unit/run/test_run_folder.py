@@ -2,7 +2,6 @@
 
 import hashlib
 import json
-import math
 import os
 import shutil
 import socket
@@ -91,22 +90,8 @@ def test_half_made_folders_are_passed_over(tmp_path):
 GOOD = {"name": "x", "experiment": "x", "recording": "/x.mcap", "supervisor": 7, "started": 1.5}
 
 
-@pytest.mark.parametrize(
-    "wrong",
-    [
-        {"started": "x"},
-        {"started": True},
-        {"started": math.nan},
-        {"started": 10**400},
-        {"supervisor": 0},
-        {"supervisor": 2**40},
-        {"supervisor": 7.5},
-        {"name": None},
-        {"recording": ["/x.mcap"]},
-    ],
-    ids=str,
-)
-def test_a_card_with_a_wrong_value_is_passed_over_with_one_warning(tmp_path, caplog, wrong):
+@pytest.mark.parametrize("wrong", [{"more": 1}, {"holds": None}], ids=str)
+def test_a_card_of_another_version_is_passed_over_with_one_warning(tmp_path, caplog, wrong):
     card = base_folder() / "broken" / "run.json"
     card.parent.mkdir()
     card.write_text(json.dumps({**GOOD, **wrong}))
