@@ -11,8 +11,7 @@ events.py      events of a run
 segments.py    segments of a run and their steady cycles
 formatting.py  numbers with units, printable texts, JSON
 calibration.py  calibration files of sensor and amplifier
-table.py       columns of numbers by name
-table_file.py  tables of any kind of file
+table.py       tables of numbers: text, NumPy, MATLAB, Parquet
 yaml/          strict YAML with the line of every value
 
 A device in another package needs ``Device``, ``DeviceInfo``, ``DeviceOptions``, ``DeviceError`` and

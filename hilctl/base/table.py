@@ -1,16 +1,33 @@
-"""Columns of numbers by name: what tables of all kinds of file have in common."""
+"""Tables of numbers in text, NumPy, MATLAB and Parquet files; errors name file and line.
 
+Encoding, separator, decimal mark, preamble, names and units of a text table are found in the text:
+
+- UTF-8 or UTF-16 with a byte-order mark, UTF-8 without one, otherwise Windows-1252.
+- Columns are separated by tabs, semicolons, commas or blanks: the first of these with which the
+  last rows consist of numbers. Numbers have a decimal point, or all of them a decimal comma.
+- The data begin with the first row that has a number in each numeric column. The row above it holds
+  the names, or only units below the names. Otherwise names may be in a comment (``#`` or ``%``) of
+  as many cells, as ``numpy.savetxt`` writes them. What is above is a preamble and is skipped.
+"""
+
+import csv
 import re
+import warnings
 from abc import ABC, abstractmethod
+from array import array
+from collections import Counter
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
-from typing import TypeAlias
+from tokenize import TokenError
+from typing import Any, TypeAlias
+from zipfile import BadZipFile
 
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.errors import DataError
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.files import no_such_file, read_bytes
 from hilctl.base.types import F64
 
 Column: TypeAlias = str | int
@@ -234,3 +251,296 @@ def check_rows(path: Path, count: int, first_row: int, last_row: int | None) -> 
 def _unit_in(name: str) -> str:
     match = _IN_BRACKETS.fullmatch(name) or _SUFFIX.fullmatch(name)
     return match["unit"] if match else ""
+
+
+MAX_TABLE_BYTES = 512 * 1024**2
+"""Largest table file; it takes a few times that in memory."""
+_COMMENT = "#%"
+_LONGEST_LINE = 100_000
+_SAMPLE = 20  # last lines that tell separator and decimal mark
+_DECIMAL_COMMA = re.compile(r"[+-]?\d*,?\d+(e[+-]?\d+)?", re.IGNORECASE)
+
+
+class TextTable(Table):
+    """A text table with its columns and rows read on request.
+
+    Args:
+        path: The file.
+        skip_rows: Lines at the start of the file to skip.
+
+    Raises:
+        InputError: The file cannot be read, or is too large.
+        DataError: It has no rows of numbers.
+    """
+
+    def __init__(self, path: Path, skip_rows: int = 0) -> None:
+        text = _decoded(path, read_bytes(path, MAX_TABLE_BYTES))
+        numbered = enumerate(re.split(r"\r\n|\r|\n", text), start=1)
+        lines = [(number, line.strip(" ")) for number, line in numbered if line.strip()]
+        lines = [each for each in lines if each[0] > skip_rows]
+        rows = [each for each in lines if each[1][0] not in _COMMENT]
+        sample = [line for _, line in rows[-_SAMPLE:] if len(line) <= _LONGEST_LINE]
+        self.path = path
+        self._separator, self._comma, self._trailing, numeric = _form(sample)
+        if not any(numeric):
+            raise DataError(f"{path}: holds no rows of numbers")
+        if len(numeric) > MAX_COLUMNS:
+            raise DataError(f"{path}: must have at most {MAX_COLUMNS} columns, got {len(numeric)}")
+        self._count = len(numeric)
+        chosen = [column for column, is_numeric in enumerate(numeric) if is_numeric]
+        first = next(
+            at for at, (_, line) in enumerate(rows) if self._is_data(self.cells(line), chosen)
+        )
+        self._rows = rows[first:]
+        above = [cells for _, line in rows[:first][-2:] if (cells := self.cells(line))]
+        names, units = self._titles(above)
+        if not names:
+            comments = (self.cells(line[1:]) for _, line in lines if line[0] in _COMMENT)
+            names = next((each for each in comments if len(each) == self._count), [])
+        super().__init__(path, names or [str(i + 1) for i in range(self._count)], units)
+
+    def cells(self, line: str) -> list[str]:
+        """Return the cells of a line; none if it is no row of a table."""
+        if len(line) > _LONGEST_LINE:
+            return []
+        return _split(self._bare(line), self._separator)
+
+    def _bare(self, line: str) -> str:
+        """Return a line without the separator that ends each row."""
+        return line.removesuffix(self._separator) if self._trailing else line
+
+    def _is_data(self, cells: list[str], numeric: Sequence[int]) -> bool:
+        return len(cells) == self._count and all(
+            _value(cells[each], self._comma) is not None for each in numeric
+        )
+
+    def _titles(self, above: list[list[str]]) -> tuple[list[str], list[str]]:
+        """Return the names and units in the last two rows above the data."""
+        above = [cells[: self._count] for cells in above if len(cells) >= self._count]
+        if not above:
+            return [], []
+        *before, last = above
+        is_units = any(last) and all(known_unit(cell) is not None or not cell for cell in last)
+        if is_units and before:
+            return before[-1], last
+        return last, []
+
+    def read(
+        self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None
+    ) -> TableRows:
+        """Read some columns of some rows; other cells may have any content.
+
+        Args:
+            columns: Their indices from 0.
+            first_row: First row of data, counted from 1.
+            last_row: Last row; None for all.
+
+        Raises:
+            DataError: Rows are missing, a row is longer or shorter than the others, or a value is
+                not a finite number; names the line.
+        """
+        check_rows(self.path, len(self._rows), first_row, last_row)
+        rows = self._rows[first_row - 1 : last_row]
+        table = self._whole(rows, columns)
+        if table is None:
+            table = self._careful(rows, columns)
+        lines = np.array([number for number, _ in rows])
+        bad = np.argwhere(~np.isfinite(table))
+        if bad.size:
+            row, column = bad[0]
+            more = np.unique(bad[:, 0]).size - 1
+            text = f"must be a finite number, got {table[row, column]}"
+            text += f"; so in {more} more rows" if more else ""
+            raise DataError(f"{self._place(lines[row], columns[column])}: {text}")
+        return TableRows(self.path, np.ascontiguousarray(table.T), lines)
+
+    def _whole(self, rows: list[tuple[int, str]], columns: Sequence[int]) -> F64 | None:
+        """Read a purely numeric table, three times as fast; None for any other."""
+        lines = (self._bare(line) for _, line in rows)
+        if self._comma:
+            if any("." in line for _, line in rows):
+                return None
+            lines = (line.replace(",", ".") for line in lines)
+        delimiter = None if self._separator == " " else self._separator
+        try:
+            with warnings.catch_warnings(action="error"):
+                table = np.loadtxt(
+                    lines, delimiter=delimiter, comments=None, quotechar='"', ndmin=2
+                )
+        except (ValueError, UserWarning):
+            return None
+        return table[:, columns] if table.shape[1] == self._count else None
+
+    def _careful(self, rows: list[tuple[int, str]], columns: Sequence[int]) -> F64:
+        """Read row by row, and name the invalid one."""
+        values = array("d")
+        for number, line in rows:
+            cells = self.cells(line)
+            if len(cells) != self._count:
+                rule = f"must have {self._count} columns, as the others have, got {len(cells)}"
+                raise DataError(f"{self.path}:{number}: {rule}: {_short(line)}")
+            for column in columns:
+                value = _value(cells[column], self._comma)
+                if value is None:
+                    text = f"must be a finite number, got {_short(cells[column])}"
+                    raise DataError(f"{self._place(number, column)}: {text}")
+                values.append(value)
+        return np.array(values).reshape(-1, len(columns))
+
+    def _place(self, line: int, column: int) -> str:
+        name, number = self.names[column], str(column + 1)
+        called = f"column {number}" if name == number else f"column {number} ({name})"
+        return f"{self.path}:{line}: {called}"
+
+
+def _decoded(path: Path, raw: bytes) -> str:
+    if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
+        encodings = ["utf-16"]
+    else:
+        encodings = ["utf-8-sig", "cp1252"]
+    for encoding in encodings:
+        try:
+            text = raw.decode(encoding)
+        except UnicodeDecodeError:
+            continue
+        if "\0" not in text:
+            return text
+    raise DataError(f"{path}: is not a text table, nor of another known kind of file")
+
+
+def _form(sample: list[str]) -> tuple[str, bool, bool, list[bool]]:
+    """Return separator, decimal comma, trailing separator, and which columns are numeric."""
+    best: tuple[tuple[float, int], str, bool, bool, list[bool]] = ((0.0, 0), " ", False, False, [])
+    for separator in "\t;, ":
+        rows = [cells for line in sample if (cells := _split(line, separator))]
+        if not rows:
+            continue
+        count = Counter(map(len, rows)).most_common(1)[0][0]
+        rows = [cells for cells in rows if len(cells) == count]
+        trailing = count > 1 and not any(cells[-1] for cells in rows)
+        if trailing:
+            rows = [cells[:-1] for cells in rows]
+        for comma in (False, True) if separator != "," and count > 1 else (False,):
+            shares = [
+                sum(_value(cell, comma) is not None for cell in column) / len(rows)
+                for column in zip(*rows, strict=True)
+            ]
+            numeric = [share >= 0.5 for share in shares]
+            score = sum(shares) / len(shares) * len(rows) / len(sample) if any(numeric) else 0.0
+            if (score, count) > best[0]:
+                best = ((score, count), separator, comma, trailing, numeric)
+    return best[1:]
+
+
+def _split(line: str, separator: str) -> list[str]:
+    try:
+        cells = next(csv.reader([line], delimiter=separator, skipinitialspace=True), [])
+    except csv.Error:  # a cell of more than 131072 characters
+        return []
+    return [cell.strip() for cell in cells]
+
+
+def _value(text: str, comma: bool) -> float | None:
+    """Return the number that a cell holds, or None."""
+    if comma:
+        if not _DECIMAL_COMMA.fullmatch(text) and text.lower() != "nan":
+            return None
+        text = text.replace(",", ".")
+    if "_" in text:  # Python accepts 1_000
+        return None
+    try:
+        return float(text)
+    except ValueError:
+        return None
+
+
+def _short(text: str) -> str:
+    return repr(text if len(text) <= 60 else text[:57] + "...")
+
+
+_Columns = dict[str, npt.NDArray[Any]]
+
+
+def open_table(path: Path, skip_rows: int = 0) -> Table:
+    """Open a table.
+
+    Args:
+        path: ``.npy``, ``.npz``, ``.mat``, ``.parquet``, or a text table.
+        skip_rows: Lines at the start of a text table to skip.
+
+    Raises:
+        InputError: The file cannot be read, or holds no columns of numbers.
+        DataError: A text table has no rows of numbers.
+    """
+    read = _READERS.get(path.suffix.lower())
+    if read is None:
+        return TextTable(path, skip_rows)
+    if not path.is_file():
+        raise InputError(no_such_file(path))
+    columns = {
+        name: each.ravel() if each.ndim == 2 and 1 in each.shape else each
+        for name, each in read(path).items()
+    }
+    columns = {
+        name: each for name, each in columns.items() if each.dtype.kind in "fiu" and each.ndim == 1
+    }
+    # Scalars and settings are stored beside the columns of samples.
+    most = max((each.size for each in columns.values()), default=0)
+    columns = {name: each for name, each in columns.items() if each.size == most}
+    if most == 0:
+        raise InputError(f"{path}: holds no array of numbers")
+    if len(columns) > MAX_COLUMNS:
+        raise InputError(f"{path}: holds {len(columns)} columns, at most {MAX_COLUMNS} are read")
+    return ArrayTable(path, columns)
+
+
+def _npy(path: Path) -> _Columns:
+    try:
+        # Mapped, not read, so that the size in the header must fit the file. NumPy parses the
+        # header as Python and passes on the errors of the parser.
+        with np.errstate(over="ignore"):
+            table = np.load(path, mmap_mode="r", allow_pickle=False)
+    except (ValueError, OSError, EOFError, OverflowError, TypeError, TokenError):
+        raise InputError(f"{path}: is not a complete NumPy file (.npy) of numbers") from None
+    if not isinstance(table, np.ndarray) or table.ndim not in {1, 2}:
+        raise InputError(f"{path}: must hold a one- or two-dimensional array of numbers")
+    return {str(at): each for at, each in enumerate(np.atleast_2d(table.T), start=1)}
+
+
+def _npz(path: Path) -> _Columns:
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as archive:
+            return dict(archive)
+    except (ValueError, OSError, EOFError, OverflowError, TypeError, TokenError, BadZipFile):
+        raise InputError(f"{path}: is not a complete NumPy archive (.npz) of arrays") from None
+
+
+def _mat(path: Path) -> _Columns:
+    from scipy.io import loadmat
+
+    try:
+        stored = loadmat(path)
+    except NotImplementedError:
+        rule = "is of MATLAB 7.3, which is not read: save it with -v7, or as .csv or .parquet"
+        raise InputError(f"{path}: {rule}") from None
+    except Exception as error:  # noqa: BLE001  SciPy raises errors of many kinds on damaged files
+        raise InputError(f"{path}: is not a MATLAB file (.mat): {error}") from None
+    return {name: each for name, each in stored.items() if isinstance(each, np.ndarray)}
+
+
+def _parquet(path: Path) -> _Columns:
+    try:
+        from pyarrow import ArrowInvalid, parquet
+    except ImportError:
+        raise InputError(
+            f"{path}: reading .parquet needs pyarrow, which is not installed "
+            "(pip install 'hilctl[parquet]')"
+        ) from None
+    try:
+        table = parquet.read_table(path)
+    except (ArrowInvalid, OSError) as error:
+        raise InputError(f"{path}: is not a Parquet file: {error}") from None
+    return {name: table[name].to_numpy() for name in table.column_names}
+
+
+_READERS = {".npy": _npy, ".npz": _npz, ".mat": _mat, ".parquet": _parquet}

@@ -30,7 +30,7 @@ from hilctl.cli.options import (
     experiment_keys,
 )
 from hilctl.cli.output import print_json, print_result
-from hilctl.experiment.sections import label_settings
+from hilctl.experiment.file import label_settings
 from hilctl.ilc.ilc_session import IlcResult, IlcRow, correction_setting
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.studies.campaign.campaign_runner import CampaignResult

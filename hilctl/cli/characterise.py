@@ -31,7 +31,7 @@ from hilctl.cli.options import (
     recording_paths,
 )
 from hilctl.cli.output import print_json, print_result
-from hilctl.experiment.sections import label_settings
+from hilctl.experiment.file import label_settings
 from hilctl.run.start import StepStoppedError
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.studies.characterise.results import Characterisation, StepRow

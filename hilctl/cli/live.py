@@ -24,9 +24,8 @@ from hilctl.cli.console import console
 from hilctl.cli.options import AsJson, run_names
 from hilctl.cli.output import print_json, safe_streams
 from hilctl.live.run_reader import RunList, RunReader
-from hilctl.live.scope import WINDOWS_S
+from hilctl.live.scope import ROW, WINDOWS_S
 from hilctl.live.server_process import SingleRun, serve_foxglove, serve_runs
-from hilctl.live.traces import ROW
 from hilctl.run.control.client import (
     JOB_CONTROL,
     MAX_MARK,

@@ -28,8 +28,8 @@ from hilctl.base.formatting import printable, unit_text
 from hilctl.cli.console import compile_progress, console, listing, progress_bar, table
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import print_json, print_result
+from hilctl.experiment.file import label_settings
 from hilctl.experiment.preflight import CheckedExperiment
-from hilctl.experiment.sections import label_settings
 from hilctl.live.server_process import served_beside
 from hilctl.loop.safe_output import describe
 from hilctl.machine.checks import log_out

@@ -1,6 +1,6 @@
 """The experiment file, everything it refers to, and its check before a run. Moves nothing.
 
-file.py           the experiment file as a model, and its JSON schema; sections.py  its sections
+file.py           the experiment file as a model, its sections and JSON schema
 load.py           an experiment with its device, model and correction
 devices.py        devices by name
 preflight.py      the check of an experiment: all rules and the complete commands
@@ -20,6 +20,6 @@ examples.py       shipped examples and copies of them
 PUBLIC = (
     "closed_loop", "coil_heat", "conditioning", "correction", "device_rules", "device_state",
     "devices", "examples", "file", "forecast", "load", "model_validity", "open_loop", "preflight",
-    "sections", "template",
+    "template",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

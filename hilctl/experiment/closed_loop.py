@@ -13,7 +13,12 @@ import numpy as np
 from hilctl.base.errors import ConfigProblem, InputError
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
-from hilctl.experiment.file import Experiment
+from hilctl.experiment.file import (
+    AnyFeedbackConfig,
+    Experiment,
+    IntegralFeedbackConfig,
+    PiFeedbackConfig,
+)
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.open_loop import (
     ASSUMED_PHASE_MARGIN_DEG,
@@ -23,7 +28,6 @@ from hilctl.experiment.open_loop import (
     LoopResponse,
     assumed_response,
 )
-from hilctl.experiment.sections import AnyFeedbackConfig, IntegralFeedbackConfig, PiFeedbackConfig
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Controller, Feedback, Gains, IntegralFeedback

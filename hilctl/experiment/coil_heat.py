@@ -11,8 +11,7 @@ import numpy as np
 
 from hilctl.base.samples import Flag, Samples
 from hilctl.base.types import F64
-from hilctl.experiment.file import Experiment
-from hilctl.experiment.sections import Limits
+from hilctl.experiment.file import Experiment, Limits
 from hilctl.kernels.interlock import heat_block
 from hilctl.loop.interlocks import warming
 

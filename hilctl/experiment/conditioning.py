@@ -11,9 +11,8 @@ import numpy as np
 
 from hilctl.base.errors import ConfigProblem
 from hilctl.base.types import F64
-from hilctl.experiment.file import Experiment
+from hilctl.experiment.file import REST_S, Experiment
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.experiment.sections import REST_S
 from hilctl.loop.lead_in import Conditioning
 
 OFFSET_SHARE = 0.25  # largest measured offset that is corrected, as a share of the stroke limits

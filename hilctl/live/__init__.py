@@ -4,14 +4,14 @@ A live view is not part of a run: it maps the run's ring read-only and sends cha
 control socket. Killing it does not affect the run.
 
 run_reader.py    reader of one run's folder; list of active runs
-traces.py        signals that are shown
-scope.py         time windows and hysteresis loops; minimum and maximum per bucket of samples
+scope.py         signals that are shown; time windows and hysteresis loops; minimum and maximum
+                 per bucket of samples
 live_metrics.py  running metrics, use of each limit
 frame_codec.py   frames for a page and for programs
-server.py, page_session.py  the page on loopback, with authentication; session of one page
+server.py        the page on loopback, with authentication; session of one page
 foxglove.py      server for Foxglove and compatible applications
 server_process.py  server processes
 """
 
-PUBLIC = ("frame_codec", "run_reader", "scope", "server_process", "traces")
+PUBLIC = ("frame_codec", "run_reader", "scope", "server_process")
 """Modules that other rooms import; the others are private."""

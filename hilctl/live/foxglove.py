@@ -24,7 +24,7 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.base.samples import COLUMNS
 from hilctl.base.types import F64
 from hilctl.live.run_reader import RunList, RunReader
-from hilctl.live.traces import ROW
+from hilctl.live.scope import ROW
 from hilctl.recording import schema
 from hilctl.recording.codec import encode_scope
 from hilctl.recording.encoder import Encoded, MessageMaker, RecordingLayout

@@ -17,8 +17,7 @@ import numpy as np
 from hilctl.base.events import Event
 from hilctl.base.types import F64
 from hilctl.live.run_reader import RunReader
-from hilctl.live.scope import WINDOWS_S, Scope
-from hilctl.live.traces import SIGNALS
+from hilctl.live.scope import SIGNALS, WINDOWS_S, Scope
 
 ScopeMode: TypeAlias = Literal["roll", "cycle"]
 

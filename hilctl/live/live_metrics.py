@@ -13,7 +13,7 @@ import numpy as np
 from hilctl.base.samples import NO_WAVEFORM, BlockBatch, BlockHeader, Flag
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64
-from hilctl.live.traces import ROW, Traces
+from hilctl.live.scope import ROW, Traces
 from hilctl.run.metadata import LimitBounds, RunDescription
 from hilctl.signals.cycle_metrics import sensor_noise_um
 from hilctl.signals.segment_metrics import SegmentMetrics

@@ -22,8 +22,7 @@ from hilctl.live.live_metrics import (
     LiveErrorSpectrum,
     RunningFigures,
 )
-from hilctl.live.scope import Scope
-from hilctl.live.traces import Traces, traces_of
+from hilctl.live.scope import Scope, Traces, traces_of
 from hilctl.run.control.client import active_runs
 from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import RunFolder

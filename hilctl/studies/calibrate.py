@@ -18,8 +18,7 @@ from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.files import check_writable, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.strict import ValidationError
-from hilctl.base.table import Column
-from hilctl.base.table_file import open_table
+from hilctl.base.table import Column, open_table
 from hilctl.base.types import F64
 from hilctl.base.yaml import dump, load_document
 from hilctl.experiment.load import load_experiment

@@ -26,14 +26,13 @@ from hilctl.experiment.closed_loop import (
     feedback_gains,
     rounded_down,
 )
-from hilctl.experiment.file import Experiment
+from hilctl.experiment.file import Experiment, IntegralFeedbackConfig, PiFeedbackConfig
 from hilctl.experiment.open_loop import (
     ASSUMED_PHASE_MARGIN_DEG,
     Exchange,
     LoopResponse,
     MeasuredResponse,
 )
-from hilctl.experiment.sections import IntegralFeedbackConfig, PiFeedbackConfig
 from hilctl.loop.feedback import Gains
 from hilctl.models.model_file import model_sha256, parse_model
 from hilctl.recording.recording import Recording

@@ -11,8 +11,7 @@ import numpy as np
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
-from hilctl.base.table import Column, Table
-from hilctl.base.table_file import open_table
+from hilctl.base.table import Column, Table, open_table
 from hilctl.base.types import F64, I64, CommandUnit
 from hilctl.identify.data.cycles import find_cycles, loops_from_pieces
 from hilctl.identify.data.data_faults import correlation
@@ -37,7 +36,7 @@ class TableRecord(NamedTuple):
 
 
 def read_table(path: Path, settings: TableSettings) -> TableRecord:
-    """Read command and displacement from a table, see :func:`hilctl.base.table_file.open_table`.
+    """Read command and displacement from a table, see :func:`hilctl.base.table.open_table`.
 
     Raises:
         InputError: The file can't be read.

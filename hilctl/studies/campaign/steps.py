@@ -18,8 +18,8 @@ from hilctl.base.files import TextFiles
 from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import Document, Loc, dotted, load_document
 from hilctl.experiment.devices import device_class, known_devices
+from hilctl.experiment.file import Condition, Name
 from hilctl.experiment.load import LoadedExperiment, named_from, resolve
-from hilctl.experiment.sections import Condition, Name
 from hilctl.studies.step_runner import document_with, setting
 
 RunOrder = Literal["as_written", "random", "alternating"]

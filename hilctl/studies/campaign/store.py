@@ -9,7 +9,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from hilctl.base.errors import ConfigError, DataError, InputError
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
-from hilctl.experiment.sections import RecordingConfig
+from hilctl.experiment.file import RecordingConfig
 from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.run_summary import read_ends, recordings_in

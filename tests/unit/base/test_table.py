@@ -5,8 +5,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.base.errors import DataError
-from hilctl.base.table import Table, TableRows
+from hilctl.base import table
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.table import Table, TableRows, TextTable, open_table
 
 
 class Names(Table):
@@ -70,3 +71,199 @@ def test_units_have_factors():
     assert [table.unit(at) for at in range(5)] == [
         ("s", 1e-3), ("um", 1e-3), ("A", 1e-3), ("", 1.0), ("um", 1.0),
     ]  # fmt: skip
+
+
+@pytest.mark.parametrize("suffix", [".npz", ".mat", ".parquet", ".npy"])
+def test_arrays_of_other_programs(tmp_path, suffix):
+    t, v, y = np.arange(50) / 100.0, np.arange(50) % 7, -2.5 * np.arange(50)
+    path = tmp_path / f"loops{suffix}"
+    if suffix == ".npz":
+        np.savez(path, t=t, v=v, y=y, note="by hand", gain=3.0)
+    elif suffix == ".npy":
+        np.save(path, np.column_stack([t, v, y]))
+    elif suffix == ".mat":
+        pytest.importorskip("scipy.io").savemat(path, {"t": t, "v": v, "y": y, "gain": 3.0})
+    else:
+        arrow = pytest.importorskip("pyarrow")
+        from pyarrow import parquet
+
+        parquet.write_table(arrow.table({"t": t, "v": v, "y": y}), path)
+    found = open_table(path).read([0, 1, 2])
+    np.testing.assert_array_equal(found.values, [t, v, y])
+    path.write_bytes(path.read_bytes()[:40])
+    with pytest.raises(InputError, match=r"loops\.\w+: "):
+        open_table(path)
+
+
+SEPARATORS = {"comma": ",", "comma and blank": ", ", "semicolon": ";", "tab": "\t", "blanks": "   "}
+
+
+@pytest.fixture
+def table(tmp_path: Path):
+    def make(text: str | bytes) -> TextTable:
+        path = tmp_path / "t.csv"
+        path.write_bytes(text.encode() if isinstance(text, str) else text)
+        return TextTable(path)
+
+    return make
+
+
+@pytest.mark.parametrize("separator", SEPARATORS.values(), ids=SEPARATORS)
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("footer", ["", "# the end\n"])
+def test_separators_and_line_ends(table, separator: str, end: str, footer: str) -> None:
+    rows = (f"{k}{separator}{-k / 8}{separator}1e{k % 3}" for k in range(5))
+    lines = ["% rig 3", "", separator.join(["t", "x", "y"]), *rows, footer]
+    made = table(end.join(lines))
+    assert made.names == ["t", "x", "y"]
+    found = made.read([made.index("y"), made.index(2)])
+    np.testing.assert_array_equal(found.values[0], [1.0, 10.0, 100.0, 1.0, 10.0])
+    np.testing.assert_array_equal(found.values[1], -np.arange(5) / 8)
+    assert found.lines.tolist() == [4, 5, 6, 7, 8]
+    assert found.values.flags.c_contiguous
+
+
+def test_numbers_keep_their_bits(table) -> None:
+    values = [0.1, 1 / 3, 5e-324, 1.7976931348623157e308, -0.0, 123456789.123456789]
+    for other in ("0", "words"):
+        text = "".join(f"{value!r},{other}\n" for value in values)
+        found = table(text).read([0]).values[0]
+        assert found.tobytes() == np.array(values).tobytes()
+
+
+@pytest.mark.parametrize(("text", "names"), [
+    ("1,2\n", ["1", "2"]),
+    ("a,b\n1,2\n", ["a", "b"]),
+    ('"a, b",c\n1,2\n', ["a, b", "c"]),
+    ("\ufeffa,b\n1,2\n", ["a", "b"]),
+    (",x\n0,1\n", ["", "x"]),
+    ("# a,b\n1,2\n", ["a", "b"]),
+    ("# by hand\n# a,b\n1,2\n", ["a", "b"]),
+    ("# by hand\n1,2\n", ["1", "2"]),
+    ("nan,1\n1,2\n", ["1", "2"]),
+    ("1,x\n1,2\n", ["1", "x"]),
+    ("a;b,c\n1;2\n", ["a", "b,c"]),
+])  # fmt: skip
+def test_names(table, text: str, names: list[str]) -> None:
+    """Names stand in the first row, or in a comment above it of as many cells."""
+    assert table(text).names == names
+
+
+@pytest.mark.parametrize(("text", "message"), [
+    ("a,b\n1,2\nx,3\n", "t.csv:3: column 1 (a): must be a finite number, got 'x'"),
+    ("a,b\n\n1,2\n# no\n,3\n", "t.csv:5: column 1 (a): must be a finite number, got ''"),
+    ("1,2\n1_0,3\n", "t.csv:2: column 1: must be a finite number, got '1_0'"),
+    ("1,2\n-inf,3\n", "t.csv:2: column 1: must be a finite number, got -inf"),
+    ("1,words\n-inf,3\n", "t.csv:2: column 1: must be a finite number, got -inf"),
+    ("1;2\n1.5;3\n1,5;3\n1.5;3\n", "t.csv:3: column 1: must be a finite number, got '1,5'"),
+    ("1,2\n3\n", "t.csv:2: must have 2 columns, as the others have, got 1: '3'"),
+    ("1,2\n3,4,5\n", "t.csv:2: must have 2 columns, as the others have, got 3: '3,4,5'"),
+    ("1,2\n" + "x" * 200_000 + ",1\n",
+     f"t.csv:2: must have 2 columns, as the others have, got 0: '{'x' * 57}...'"),
+])  # fmt: skip
+def test_mistakes_have_their_line(table, text: str, message: str) -> None:
+    assert refusal(table(text).read, [0]) == message
+
+
+@pytest.mark.parametrize("text", ["", " \n\t\n", "# a,b\n", "a,b\n"])
+def test_nothing(table, text: str) -> None:
+    """Neither header nor rows."""
+    assert refusal(table, text).startswith("t.csv: holds no rows")
+
+
+def test_what_is_not_asked_for_may_be_anything(table) -> None:
+    made = table("t,label\n1,up\n2,down\n3,\nthe end\n")
+    found = made.read([0], 1, 3)
+    np.testing.assert_array_equal(found.values, [[1.0, 2.0, 3.0]])
+    assert found.lines.tolist() == [2, 3, 4]
+    assert refusal(made.read, [0]).startswith("t.csv:5: must have 2 columns")
+
+
+@pytest.mark.parametrize("other", ["0", "words"])
+@pytest.mark.parametrize(("first", "last", "found"), [
+    (1, None, [0, 1, 2, 3]), (2, 3, [1, 2]), (4, 4, [3]), (4, None, [3]),
+    (5, None, "5 to the last"), (0, 2, "0 to 2"), (3, 2, "3 to 2"), (1, 5, "1 to 5"),
+])  # fmt: skip
+def test_rows(table, other: str, first: int, last: int | None, found: list[int] | str) -> None:
+    """Rows count from 1; those that are not there are refused, whichever way it is read."""
+    made = table("".join(f"{k},{other}\n" for k in range(4)))
+    if isinstance(found, str):
+        text = f"t.csv: has 4 rows: rows {found} are not all there"
+        assert refusal(made.read, [0], first, last) == text
+    else:
+        assert made.read([0], first, last).values.tolist() == [found]
+
+
+def test_a_table_too_large_is_not_read(table, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(table, "MAX_TABLE_BYTES", 1_000_000)
+    with pytest.raises(InputError, match=r"t\.csv: has 2 MB.* 1 MB"):
+        table(b"\xff" * 2_000_000)
+
+
+def test_lines_that_are_no_row_are_refused_at_once(tmp_path):
+    path = tmp_path / "wide.csv"
+    path.write_text("1," * 5000 + "\n1\n")
+    with pytest.raises(DataError, match="at most 1000 columns"):
+        TextTable(path)
+
+
+def test_comments_without_end_are_no_header(tmp_path):
+    path = tmp_path / "long.csv"
+    path.write_text("#" + "a" * 200_000 + "\n# b\n1\n2\n")
+    assert TextTable(path).names == ["b"]
+
+
+INSTRUMENTS = {
+    "tektronix": (
+        "Model,MSO44\nFirmware,1.2\nRecord Length,3\n\nTIME,CH1,CH2\n"
+        "-1.0e-3,1.5,0.25\n0,1.6,0.5\n1.0e-3,1.7,0.75\n",
+        {"TIME": [-1e-3, 0.0, 1e-3], "CH1": [1.5, 1.6, 1.7], "CH2": [0.25, 0.5, 0.75]},
+        ["", "", ""],
+    ),
+    "keysight": (
+        "x-axis,1,2\nsecond,Volt,Volt\n-1.0E-03,+1.5E+00,+2.5E-01\n+0.0E+00,+1.6E+00,+5.0E-01\n",
+        {"x-axis": [-1e-3, 0.0], "1": [1.5, 1.6], "2": [0.25, 0.5]},
+        ["s", "V", "V"],
+    ),
+    "rigol": (
+        "X,CH1,CH2,Start,Increment,\nSequence,Volt,Volt,-1.0e-03,1.0e-03,\n"
+        "0,1.5,0.25,\n1,1.6,0.5,\n2,1.7,0.75,\n",
+        {"X": [0.0, 1.0, 2.0], "CH1": [1.5, 1.6, 1.7], "CH2": [0.25, 0.5, 0.75]},
+        ["", "V", "V"],
+    ),
+    "labview": (
+        "LabVIEW Measurement\nSeparator\tTab\nDecimal_Separator\t,\n***End_of_Header***\n"
+        "X_Value\tVoltage (mV)\tPosition (nm)\tComment\n"
+        "0,000\t1,5\t250\tstart\n0,001\t1,6\t500\t\n0,002\t1,7\t750\t\n",
+        {"X_Value": [0.0, 0.001, 0.002], "Voltage (mV)": [1.5, 1.6, 1.7]},
+        ["", "V"],
+    ),
+    "dspace": (
+        "path;experiment 3\nvariables;3\n\ntime [s];Platform/AO [V];Platform/Sensor [\u00b5m]\n"
+        "0,000;1,5;0,25\n0,001;1,6;0,5\n",
+        {"time [s]": [0.0, 0.001], "Platform/Sensor": [0.25, 0.5]},
+        ["s", "um"],
+    ),
+}
+
+
+@pytest.mark.parametrize("encoding", ["utf-8", "utf-8-sig", "cp1252", "utf-16"])
+@pytest.mark.parametrize(("text", "columns", "units"), INSTRUMENTS.values(), ids=INSTRUMENTS)
+def test_files_of_instruments(table, encoding, text, columns, units):
+    """Preambles, rows of units, decimal commas, trailing separators and every encoding."""
+    made = table(text.encode(encoding))
+    found = [made.index(name) for name in columns]
+    np.testing.assert_array_equal(made.read(found).values, list(columns.values()))
+    assert [made.unit(each)[0] for each in found] == units
+
+
+def test_lines_above_the_table_are_skipped_on_request(tmp_path):
+    path = tmp_path / "t.csv"
+    path.write_text("7,8\na,b\n1,2\n3,4\n")
+    assert TextTable(path, skip_rows=1).names == ["a", "b"]
+
+
+def test_gaps_are_counted(table):
+    text = "t,x\n" + "".join(f"{k},{'nan' if k in (3, 4, 9) else k}\n" for k in range(20))
+    place, rule = "t.csv:5: column 2 (x)", "must be a finite number, got nan"
+    assert refusal(table(text).read, [1]) == f"{place}: {rule}; so in 2 more rows"

@@ -17,8 +17,7 @@ from hilctl.base.events import Event
 from hilctl.cli import live as module
 from hilctl.cli.console import print_rich
 from hilctl.cli.live import View, print_lines
-from hilctl.live.scope import WINDOWS_S, Buckets, ScopeWindow
-from hilctl.live.traces import SIGNALS
+from hilctl.live.scope import SIGNALS, WINDOWS_S, Buckets, ScopeWindow
 from hilctl.run.run_folder import run_folder
 
 

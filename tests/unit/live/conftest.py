@@ -7,7 +7,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.samples import BlockHeader
-from hilctl.live.traces import ROW, SIGNALS, Traces
+from hilctl.live.scope import ROW, SIGNALS, Traces
 from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared.ring import SampleRing

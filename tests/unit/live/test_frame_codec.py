@@ -10,8 +10,7 @@ import pytest
 from hilctl.base.events import Event
 from hilctl.base.segments import Segment
 from hilctl.live.frame_codec import frame_of, frames_of, nearest_window_s
-from hilctl.live.scope import Buckets, Scope, ScopeWindow
-from hilctl.live.traces import ROW, SIGNALS
+from hilctl.live.scope import ROW, SIGNALS, Buckets, Scope, ScopeWindow
 from tests.fakes import SteppingClock
 from tests.unit.live.conftest import traces
 

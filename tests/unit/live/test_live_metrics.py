@@ -8,7 +8,7 @@ import pytest
 from hilctl.base.samples import BlockBatch, BlockHeader, Flag
 from hilctl.base.segments import Segment
 from hilctl.live import live_metrics
-from hilctl.live.traces import ROW
+from hilctl.live.scope import ROW
 from hilctl.run.metadata import RunDescription
 from hilctl.run.start import checked_experiment
 from hilctl.signals.cycle_metrics import peak_hysteresis_percent

@@ -8,7 +8,7 @@ import pytest
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.live.run_reader import RunList, RunReader
-from hilctl.live.traces import ROW
+from hilctl.live.scope import ROW
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared.shared_page import PageField, Stop

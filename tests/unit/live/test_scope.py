@@ -3,10 +3,9 @@
 import numpy as np
 import pytest
 
-from hilctl.base.samples import Flag
+from hilctl.base.samples import COLUMNS, BlockBatch, Flag
 from hilctl.base.segments import Segment
-from hilctl.live.scope import BUCKETS, WINDOWS_S, MinMaxTrace, Scope
-from hilctl.live.traces import ROW
+from hilctl.live.scope import BUCKETS, ROW, SIGNALS, WINDOWS_S, MinMaxTrace, Scope, traces_of
 from tests.unit.live.conftest import traces
 
 RATE = 1000.0
@@ -142,3 +141,33 @@ def test_samples_before_the_origin_are_ignored():
     assert envelope.newest == -1
     envelope.add(traces(9, reference=[3.0, 4.0]))
     assert envelope.window(0, 1).low[0].tolist() == [4.0]
+
+
+def batch():
+    made = BlockBatch.empty(2, 2, 1)
+    made.heads[:, 1] = (10, 14)
+    made.columns[:] = np.arange(float(len(COLUMNS)))[None, :, None]
+    return made
+
+
+def test_error_is_displacement_minus_reference():
+    traces = traces_of(batch(), "um")
+    assert traces.index.tolist() == [10, 11, 14, 15]
+    assert traces.values[:, 0].tolist() == [0.0, 3.0, 3.0, 2.0, 4.0, 1.0]
+    assert len(SIGNALS) == 6
+
+
+def test_reference_in_another_unit_has_no_error():
+    traces = traces_of(batch(), "A")
+    assert np.isnan(traces.values[[ROW["reference"], ROW["error"]]]).all()
+    assert np.isfinite(traces.values[ROW["displacement"]]).all()
+
+
+def test_infinite_values_are_missing():
+    made = batch()
+    made.columns[0, 3, 0] = np.inf
+    assert np.isnan(traces_of(made, "um").values[ROW["displacement"], 0])
+
+
+def test_a_part_is_by_sample_index():
+    assert traces_of(batch(), "um").part(11, 15).index.tolist() == [11, 14]

@@ -11,8 +11,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
 from hilctl.base.yaml import Document
 from hilctl.experiment.closed_loop import gains_for, make_feedback
-from hilctl.experiment.file import Experiment
-from hilctl.experiment.sections import PiFeedbackConfig
+from hilctl.experiment.file import Experiment, PiFeedbackConfig
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains, IntegralFeedback
 from hilctl.loop.limiter import CommandLimits

@@ -8,13 +8,15 @@ import numpy as np
 import pytest
 
 from hilctl.base import types
-from hilctl.base.errors import InputError
+from hilctl.base.errors import DataError, InputError
+from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader
 from hilctl.base.segments import Segment
-from hilctl.base.types import chunks
+from hilctl.base.types import F64, chunks
 from hilctl.waveforms import build as module
 from hilctl.waveforms import shapes
 from hilctl.waveforms.build import Reference, RepeatedPart, build
 from hilctl.waveforms.spec import Hold
+from tests.unit.experiment.test_device_state import write_recording
 
 Made = Callable[..., Reference]
 SINE: dict[str, Any] = {"kind": "sine", "amplitude": 6.0, "frequency_hz": 10.0}
@@ -282,3 +284,356 @@ def test_a_value_that_is_none_is_refused_wherever_it_is(made: Made, small: None)
     keys = {"kind": "growing", "amplitude": 1.7e308, "offset": 1.7e308, "frequency_hz": 0.3}
     with pytest.raises(InputError, match="too large"):
         made(1000.0, **keys, duration_s=40.0)
+
+
+RATE_HZ = 1000.0
+WAVE = np.round(3.0 * np.sin(2.0 * np.pi * 10.0 * np.arange(200) / RATE_HZ), 6)
+T_S = np.arange(200) / RATE_HZ
+Read = Callable[..., Reference]
+
+
+@pytest.fixture
+def read(made: Made, tmp_path: Path) -> Read:
+    """Write bytes or text to a file and build the waveform that reads it."""
+
+    def write_and_read(content: str | bytes, name: str = "w.csv", **keys: Any) -> Reference:
+        raw = content.encode() if isinstance(content, str) else content
+        (tmp_path / name).write_bytes(raw)
+        return made(RATE_HZ, tmp_path, kind="file", path=name, **{"unit": "um"} | keys)
+
+    return write_and_read
+
+
+def refusal(read: Read, content: str | bytes, name: str = "w.csv", **keys: Any) -> str:
+    """Return the message without the folder in front."""
+    with pytest.raises(InputError) as caught:
+        read(content, name, **keys)
+    place, found, text = str(caught.value).partition(f"/{name}:")
+    assert found, caught.value
+    assert Path(place).is_absolute()
+    return text.removeprefix(" ")
+
+
+def rows(*columns: Any, delimiter: str = ",") -> str:
+    return "".join(
+        delimiter.join(repr(float(v)) for v in row) + "\n" for row in zip(*columns, strict=True)
+    )
+
+
+@pytest.mark.parametrize("suffix", [".csv", ".npy", ".mcap"])
+def test_name_that_no_file_can_have(made: Made, tmp_path: Path, suffix: str) -> None:
+    with pytest.raises(InputError, match="name too long"):
+        made(RATE_HZ, tmp_path, kind="file", path="x" * 300 + suffix, file_rate_hz=RATE_HZ)
+
+
+def test_period_shorter_than_a_sample(read: Read) -> None:
+    text = refusal(read, "1\n2\n", period_s=1e-9, file_rate_hz=RATE_HZ)
+    assert text.startswith("period_s must be")
+
+
+class TestText:
+    @pytest.mark.parametrize("delimiter", [",", ";", "\t", " "])
+    @pytest.mark.parametrize("header", ["", "t_s{}x_um{}y_um\n"])
+    def test_delimiters_with_and_without_header(
+        self, read: Read, delimiter: str, header: str
+    ) -> None:
+        text = header.format(delimiter, delimiter) + rows(T_S, WAVE, -WAVE, delimiter=delimiter)
+        keys = {} if header else {"file_rate_hz": RATE_HZ}
+        reference = read(text, column=2, **keys)
+        np.testing.assert_array_equal(reference.values, WAVE)
+        assert reference.segments == (Segment("file w.csv", 0, 200, 0, 200, 0.0),)
+
+    def test_column_by_name(self, read: Read) -> None:
+        text = "t_s, x_um , y_um\n" + rows(T_S, WAVE, -WAVE)
+        np.testing.assert_array_equal(read(text, column="y_um").values, -WAVE)
+        np.testing.assert_array_equal(read(text, column="x_um").values, WAVE)
+
+    def test_column_by_number(self, read: Read) -> None:
+        """A number counts columns from 1, even as text where there are no names."""
+        text = "t_s,x_um,y_um\n" + rows(T_S, WAVE, -WAVE)
+        np.testing.assert_array_equal(read(text, column=3).values, -WAVE)
+        bare = rows(WAVE, -WAVE)
+        np.testing.assert_array_equal(read(bare, column="2", file_rate_hz=1e3).values, -WAVE)
+
+    def test_scale_offset_and_softness(self, read: Read) -> None:
+        text = rows(WAVE)
+        plain = read(text, file_rate_hz=RATE_HZ, scale=-2.0, offset=5.0)
+        np.testing.assert_array_equal(plain.values, 5.0 - 2.0 * WAVE)
+        soft = read(text, file_rate_hz=RATE_HZ, offset=5.0, soft_start_s=0.05, soft_end_s=0.05)
+        assert soft.values[0] == 0.0
+        assert soft.values[-1] == 0.0
+        np.testing.assert_array_equal(soft.values[50:150], 5.0 + WAVE[50:150])
+        assert (soft.segments[0].steady_start, soft.segments[0].steady_stop) == (50, 150)
+
+    def test_period_makes_steady_cycles(self, read: Read) -> None:
+        segment = read(rows(WAVE), file_rate_hz=RATE_HZ, period_s=0.1).segments[0]
+        assert segment.period == pytest.approx(100.0)
+        assert segment.steady_cycles() == (100, 200, 1)
+
+    @pytest.mark.parametrize(
+        ("first", "last"), [(1, None), (11, None), (1, 50), (11, 50), (199, 200)]
+    )
+    def test_row_range(self, read: Read, first: int, last: int | None) -> None:
+        text = "t_s,x_um\n" + rows(T_S, WAVE)
+        reference = read(text, column="x_um", first_row=first, last_row=last)
+        np.testing.assert_array_equal(reference.values, WAVE[first - 1 : last])
+
+
+class TestTextRefused:
+    def test_not_a_number(self, read: Read) -> None:
+        bad = WAVE.copy()
+        bad[16] = np.nan
+        text = "t_s,x_um\n" + rows(T_S, bad)
+        message = "18: column 2 (x_um): must be a finite number, got nan"
+        assert refusal(read, text, column="x_um") == message
+        assert refusal(read, text, column="x_um", first_row=10) == message
+        assert read(text, column="x_um", first_row=18).values.size == 183
+
+    def test_value_that_overflows(self, read: Read) -> None:
+        text = rows(WAVE)
+        for soft_s in (0.0, 0.1):
+            with pytest.raises(InputError, match="too large"):
+                read(text, file_rate_hz=RATE_HZ, scale=1e308, offset=-1e308, soft_end_s=soft_s)
+
+    def test_missing_file(self, made: Made, tmp_path: Path) -> None:
+        for name in ("no.csv", "."):
+            with pytest.raises(InputError) as caught:
+                made(RATE_HZ, tmp_path, kind="file", path=name)
+            assert str(caught.value) == f"{tmp_path / name}: no such file"
+
+    @pytest.mark.parametrize(("first", "last"), [(1, 201), (201, None), (500, 600)])
+    def test_rows_that_are_not_there(self, read: Read, first: int, last: int | None) -> None:
+        text = refusal(read, rows(WAVE), file_rate_hz=1e3, first_row=first, last_row=last)
+        assert text.startswith(f"has 200 rows: rows {first} to {last or ''}")
+
+    def test_one_row(self, read: Read) -> None:
+        text = refusal(read, rows(WAVE), file_rate_hz=1e3, first_row=200)
+        assert "two rows" in text
+
+
+class TestRate:
+    def test_contradiction(self, read: Read) -> None:
+        text = refusal(read, "t_s,x\n" + rows(T_S, WAVE), column="x", file_rate_hz=999.0)
+        assert "file_rate_hz is 999 Hz" in text
+        assert read("t_s,x\n" + rows(T_S, WAVE), column="x", file_rate_hz=1000).values.size == 200
+
+    def test_mismatch_is_refused(self, read: Read) -> None:
+        text = refusal(read, rows(WAVE), file_rate_hz=500.0)
+        assert "500 Hz" in text
+        assert "resample" in text
+        nearly = refusal(read, rows(WAVE), file_rate_hz=1000.01)
+        assert "1000.01 Hz" in nearly
+
+    def test_rounded_times_keep_the_rate(self, read: Read) -> None:
+        times = [f"{t:.9f}" for t in T_S + 12.3456789]
+        text = "t_s,x\n" + "".join(
+            f"{t},{x!r}\n" for t, x in zip(times, WAVE.tolist(), strict=True)
+        )
+        np.testing.assert_array_equal(read(text, column="x").values, WAVE)
+
+    @pytest.mark.parametrize("file_rate_hz", [250.0, 400.0, 2500.0])
+    def test_linear(self, read: Read, file_rate_hz: float) -> None:
+        corners = np.array([0.0, 2.0, -1.0, 4.0, 4.0, 0.5])
+        values = read(rows(corners), file_rate_hz=file_rate_hz, resample="linear").values
+        last_s = 5.0 / file_rate_hz
+        assert values.size == int(last_s * RATE_HZ + 1e-9) + 1
+        for k, value in enumerate(values):
+            at = k / RATE_HZ * file_rate_hz
+            i = min(int(at + 1e-9), 4)
+            expected = corners[i] + (at - i) * (corners[i + 1] - corners[i])
+            assert value == pytest.approx(expected, abs=1e-12)
+
+    def test_cubic(self, read: Read) -> None:
+        """Cubic resampling gives a cubic back exactly, where straight lines do not."""
+        t = np.arange(41) / 200.0
+        cubic = 1.0 - 20.0 * t + 300.0 * t**2 - 900.0 * t**3
+        fine_s = np.arange(201) / RATE_HZ
+        expected = 1.0 - 20.0 * fine_s + 300.0 * fine_s**2 - 900.0 * fine_s**3
+        values = read(rows(cubic), file_rate_hz=200.0, resample="cubic").values
+        np.testing.assert_allclose(values, expected, rtol=0.0, atol=1e-11)
+        straight = read(rows(cubic), file_rate_hz=200.0, resample="linear").values
+        assert np.max(np.abs(straight - expected)) > 1e-4
+
+    def test_resampling_where_rates_agree(self, read: Read) -> None:
+        for how in ("linear", "cubic"):
+            values = read(rows(WAVE), file_rate_hz=RATE_HZ, resample=how).values
+            np.testing.assert_array_equal(values, WAVE)
+
+    def test_period_after_resampling(self, read: Read) -> None:
+        reference = read(rows(WAVE), file_rate_hz=250.0, resample="linear", period_s=0.4)
+        assert reference.segments[0].period == pytest.approx(400.0)
+
+    def test_row_range_keeps_the_rate(self, read: Read) -> None:
+        text = "t_s,x\n" + rows(T_S * 2.0, WAVE)
+        part = read(text, column="x", resample="linear", first_row=51, last_row=100)
+        assert part.values.size == 99
+        np.testing.assert_allclose(part.values[::2], WAVE[50:100], rtol=0.0, atol=1e-12)
+
+    def test_resampled_too_long(self, read: Read, monkeypatch: pytest.MonkeyPatch) -> None:
+        with pytest.raises(InputError, match=r"^has 1\.99e\+14 samples"):
+            read(rows(WAVE), file_rate_hz=1e-9, resample="linear")
+        monkeypatch.setattr(shapes, "MAX_SAMPLES", 300)
+        with pytest.raises(InputError, match="398 samples"):
+            read(rows(WAVE), file_rate_hz=500.0, resample="linear")
+
+
+def npy(tmp_path: Path, array: Any) -> bytes:
+    np.save(tmp_path / "made.npy", array, allow_pickle=True)
+    return (tmp_path / "made.npy").read_bytes()
+
+
+class TestNpy:
+    @pytest.mark.parametrize("dtype", ["<f8", "<f4", ">f8"])
+    def test_one_dimension(self, read: Read, tmp_path: Path, dtype: str) -> None:
+        content = npy(tmp_path, WAVE.astype(dtype))
+        values = read(content, "w.npy", file_rate_hz=RATE_HZ).values
+        np.testing.assert_array_equal(values, WAVE.astype(dtype))
+        assert values.dtype == np.float64
+
+    def test_whole_numbers(self, read: Read, tmp_path: Path) -> None:
+        content = npy(tmp_path, np.arange(-5, 5, dtype=np.int16))
+        values = read(content, "w.npy", file_rate_hz=RATE_HZ).values
+        np.testing.assert_array_equal(values, np.arange(-5.0, 5.0))
+
+    @pytest.mark.parametrize("order", ["C", "F"])
+    def test_two_dimensions(self, read: Read, tmp_path: Path, order: Any) -> None:
+        table = np.array(np.column_stack([WAVE, -WAVE]), order=order)
+        content = npy(tmp_path, table)
+        values = read(content, "w.npy", column=2, file_rate_hz=RATE_HZ).values
+        np.testing.assert_array_equal(values, -WAVE)
+        text = refusal(read, content, "w.npy", file_rate_hz=RATE_HZ)
+        assert text.endswith("1, 2")
+
+    def test_upper_case_ending(self, read: Read, tmp_path: Path) -> None:
+        values = read(npy(tmp_path, WAVE), "W.NPY", file_rate_hz=RATE_HZ).values
+        np.testing.assert_array_equal(values, WAVE)
+
+    @pytest.mark.parametrize("name", ["w.npy", "w.csv"])
+    def test_rate_is_needed(self, read: Read, tmp_path: Path, name: str) -> None:
+        content = npy(tmp_path, WAVE) if name == "w.npy" else rows(WAVE)
+        assert "file_rate_hz" in refusal(read, content, name)
+
+    def test_not_finite(self, read: Read, tmp_path: Path) -> None:
+        bad = WAVE.copy()
+        bad[3] = np.inf
+        text = refusal(read, npy(tmp_path, bad), "w.npy", file_rate_hz=RATE_HZ)
+        assert text.startswith("row 4: ")
+
+    def test_too_large(self, read: Read, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+        monkeypatch.setattr(shapes, "MAX_SAMPLES", 100)
+        text = refusal(read, npy(tmp_path, WAVE), "w.npy", file_rate_hz=RATE_HZ)
+        assert text.startswith("has 200 samples")
+
+    def test_objects_are_never_unpickled(self, read: Read, tmp_path: Path) -> None:
+        content = npy(tmp_path, np.array([1.0, None], dtype=object))
+        text = refusal(read, content, "w.npy", file_rate_hz=RATE_HZ)
+        assert "NumPy file" in text
+
+    @pytest.mark.parametrize("cut", [0, 5, 60, 300])
+    def test_cut_short(self, read: Read, tmp_path: Path, cut: int) -> None:
+        content = npy(tmp_path, WAVE)[:cut]
+        text = refusal(read, content, "w.npy", file_rate_hz=RATE_HZ)
+        assert "NumPy file" in text
+
+    @pytest.mark.parametrize(
+        "array", [np.float64(3.0), np.ones((2, 2, 2)), np.array(["a", "b"]), np.ones(3) * 1j]
+    )
+    def test_wrong_kind(self, read: Read, tmp_path: Path, array: Any) -> None:
+        text = refusal(read, npy(tmp_path, array), "w.npy", file_rate_hz=RATE_HZ)
+        assert "array of numbers" in text
+
+    @pytest.mark.parametrize(
+        "shape",
+        ["(10**15,)", "(1000000000000000,)", "(4294967296, 4294967296)", "(9223372036854775808,)",
+         "(-1,)", "(True,)", "(" * 5000, "('''"],
+    )  # fmt: skip
+    def test_head_that_lies(self, read: Read, shape: str) -> None:
+        head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
+        content = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(80)
+        text = refusal(read, content, "w.npy", file_rate_hz=RATE_HZ)
+        assert "NumPy file" in text
+
+    @pytest.mark.parametrize("shape", [(0,), (0, 2), (5, 0)])
+    def test_empty(self, read: Read, tmp_path: Path, shape: tuple[int, ...]) -> None:
+        text = refusal(read, npy(tmp_path, np.empty(shape)), "w.npy", file_rate_hz=RATE_HZ)
+        assert "array of numbers" in text
+
+
+BLOCK = 20
+
+
+def column(k: int) -> F64:
+    """Return the samples of one recorded column: float64[100], each column its own."""
+    return k + 0.01 * np.arange(100)
+
+
+def record(path: Path, firsts: list[int], columns: F64) -> None:
+    blocks = len(firsts)
+    batch = BlockBatch.empty(blocks, BLOCK, 1)
+    batch.heads[:, BlockHeader.FIRST_SAMPLE] = firsts
+    batch.heads[:, BlockHeader.SAMPLES] = BLOCK
+    batch.heads[1:, BlockHeader.DROPPED_BEFORE] = np.diff(firsts) - BLOCK
+    batch.columns[:] = columns.reshape(len(COLUMNS), blocks, BLOCK).transpose(1, 0, 2)
+    write_recording(path, batch, RATE_HZ, measured=True)
+
+
+@pytest.fixture
+def recording(tmp_path: Path) -> Path:
+    """A recording of 100 samples at 1 kHz."""
+    path = tmp_path / "run.mcap"
+    record(path, [0, 20, 40, 60, 80], np.array([column(k) for k in range(len(COLUMNS))]))
+    return path
+
+
+@pytest.mark.parametrize(
+    ("name", "k"), [("reference_um", 0), ("wanted", 1), ("command", 2), ("displacement_um", 3)]
+)
+def test_columns(made: Made, recording: Path, name: str, k: int) -> None:
+    keys = {"kind": "file", "path": recording.name, "column": name}
+    reference = made(RATE_HZ, recording.parent, **keys)
+    np.testing.assert_array_equal(reference.values, column(k))
+    assert reference.segments[0].label == "file run.mcap"
+
+
+def test_rows_scale_and_rate(made: Made, recording: Path) -> None:
+    keys = {"kind": "file", "path": recording.name, "column": "command", "scale": 2.0}
+    part = made(RATE_HZ, recording.parent, **keys, first_row=11, last_row=20)
+    np.testing.assert_array_equal(part.values, 2.0 * column(2)[10:20])
+    finer = made(2000.0, recording.parent, **keys, resample="linear")
+    np.testing.assert_allclose(finer.values, 4.0 + 0.01 * np.arange(199), rtol=0.0, atol=1e-12)
+    with pytest.raises(InputError, match="resample"):
+        made(2000.0, recording.parent, **keys)
+
+
+def test_column_is_needed(made: Made, recording: Path) -> None:
+    known = "reference_um, displacement_um, command, wanted"
+    with pytest.raises(InputError, match=f"one of {known}"):
+        made(RATE_HZ, recording.parent, kind="file", path=recording.name)
+    with pytest.raises(InputError, match=f"'flags': .*{known}"):
+        made(RATE_HZ, recording.parent, kind="file", path=recording.name, column="flags")
+
+
+def test_not_a_number(made: Made, tmp_path: Path) -> None:
+    columns = np.array([column(k) for k in range(len(COLUMNS))])
+    columns[0, 30:] = np.nan
+    record(tmp_path / "run.mcap", [0, 20, 40, 60, 80], columns)
+    keys = {"kind": "file", "path": "run.mcap", "column": "reference_um"}
+    with pytest.raises(InputError, match="row 31: "):
+        made(RATE_HZ, tmp_path, **keys)
+    np.testing.assert_array_equal(
+        made(RATE_HZ, tmp_path, **keys, last_row=30).values, columns[0, :30]
+    )
+
+
+def test_gap(made: Made, tmp_path: Path) -> None:
+    """A recording that lacks samples is refused: closing the gap would make a step."""
+    columns = np.array([column(k) for k in range(len(COLUMNS))])
+    record(tmp_path / "run.mcap", [0, 20, 60, 80, 100], columns)
+    with pytest.raises(InputError, match="missing"):
+        made(RATE_HZ, tmp_path, kind="file", path="run.mcap", column="command")
+
+
+def test_not_a_recording(made: Made, tmp_path: Path) -> None:
+    (tmp_path / "run.mcap").write_bytes(b"not an MCAP file at all")
+    with pytest.raises(DataError, match="MCAP file"):
+        made(RATE_HZ, tmp_path, kind="file", path="run.mcap", column="command")
