@@ -22,7 +22,6 @@ from hilctl.analysis.plot_style import (
     draw_over_time,
     plain_numbers,
 )
-from hilctl.analysis.quantiles import Quantiles
 from hilctl.analysis.response.bode import response_sheet
 from hilctl.analysis.response.frequency_response import frequency_response
 from hilctl.analysis.response.step_response import step_response as measured_step
@@ -32,6 +31,7 @@ from hilctl.analysis.steady_state import (
     steady_samples,
     trusted,
 )
+from hilctl.analysis.tick_lateness import Quantiles
 from hilctl.base.errors import DataError
 from hilctl.base.formatting import quantity, short_name
 from hilctl.base.samples import Samples

@@ -9,9 +9,9 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from hilctl.analysis import tick_lateness
-from hilctl.analysis.quantiles import Quantiles
 from hilctl.analysis.run_metrics import RunReport, SegmentReport
 from hilctl.analysis.steady_state import judged, loop_signals, trusted
+from hilctl.analysis.tick_lateness import Quantiles
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, CHANGES, LOST_READINGS, MARK, Event
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples

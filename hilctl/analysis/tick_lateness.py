@@ -1,11 +1,58 @@
-"""Lateness of ticks: percentiles, late ticks and missed deadlines."""
+"""Percentiles in bounded memory; lateness of ticks, late ticks and missed deadlines."""
+
+import math
+from collections.abc import Sequence
+from typing import Any
 
 import numpy as np
 
-from hilctl.analysis.quantiles import MOST_EXACT, Quantiles
 from hilctl.base.errors import DataError
+from hilctl.base.types import F64, I64
 from hilctl.loop.pacer import USUAL_MISSED_SHARE, deadline_misses
 from hilctl.recording.recording import Recording, Ticks
+
+MOST_EXACT = 2**21
+"""Most values that are all kept."""
+
+
+class Quantiles:
+    """Distribution of values.
+
+    Attributes:
+        size: Number of values.
+        largest: The largest one; -inf without any.
+    """
+
+    def __init__(self) -> None:
+        self.size = 0
+        self.largest = -math.inf
+        self._every = 1
+        self._parts: list[Any] = []
+
+    def add(self, values: F64 | I64) -> None:
+        """Add values, float64[n] or int64[n], without NaN."""
+        if values.size == 0:
+            return
+        self._parts.append(values[-self.size % self._every :: self._every].copy())
+        self.size += values.size
+        self.largest = max(self.largest, float(values.max()))
+        while self.size > self._every * MOST_EXACT:
+            self._every *= 2
+            self._parts = [np.concatenate(self._parts)[::2]]
+
+    def percentiles(self, percents: Sequence[float]) -> list[float]:
+        """Return percentiles as :func:`numpy.percentile`, of at least one value."""
+        return list(np.percentile(np.concatenate(self._parts), percents).tolist())
+
+    def median(self) -> float:
+        """Return the median of at least one value."""
+        return float(np.median(np.concatenate(self._parts)))
+
+    def above(self, threshold: float) -> int:
+        """Count the values above a threshold; of very many, an estimate."""
+        above = sum(int(np.count_nonzero(part > threshold)) for part in self._parts)
+        return min(self.size, above * self._every)
+
 
 MOST_ROWS = 1440
 """Most rows of lateness by minute: the minutes of a day."""

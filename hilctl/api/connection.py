@@ -19,7 +19,7 @@ from hilctl.run.control.client import (
 from hilctl.run.run_folder import RunFolder
 
 if TYPE_CHECKING:
-    from hilctl.live.frame_codec import RunFrame
+    from hilctl.live.run_reader import RunFrame
 
 
 def connect(run: str | None = None) -> "RunConnection":
@@ -112,8 +112,7 @@ class RunConnection:
         for name, value, least in (("every_s", every_s, 0.0), ("window_s", window_s, 1e-3)):
             if not least <= value <= 1e5:
                 raise InputError(f"{name} must be from {least:g} to 100000 s (got {value:g})")
-        from hilctl.live.frame_codec import frames_of
-        from hilctl.live.run_reader import RunReader
+        from hilctl.live.run_reader import RunReader, frames_of
 
         return frames_of(RunReader(self._folder), every_s, window_s, time.monotonic, time.sleep)
 

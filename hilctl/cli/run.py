@@ -32,7 +32,7 @@ from hilctl.experiment.file import label_settings
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.live.server_process import served_beside
 from hilctl.loop.safe_output import describe
-from hilctl.machine.checks import log_out
+from hilctl.machine.diagnosis import log_out
 from hilctl.machine.procfs import Machine
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.result import Progress as RunProgress

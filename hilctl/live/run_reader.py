@@ -1,19 +1,24 @@
-"""Readers of active runs: newest signals, metrics, limits and events of each.
+"""Readers of active runs: newest signals, metrics, limits and events of each, and frames of them.
 
 The ring is mapped read-only and copied data are validated, so that the loop and the recorder are
 not affected. Time is an argument.
 """
 
+import json
 import math
 import os
+import struct
 from collections.abc import Callable, Iterable, Iterator
 from contextlib import suppress
-from dataclasses import asdict
+from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, Literal, TypeAlias
+
+import numpy as np
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
+from hilctl.base.types import F64
 from hilctl.live.live_metrics import (
     EDGES_US,
     Gauge,
@@ -22,7 +27,7 @@ from hilctl.live.live_metrics import (
     LiveErrorSpectrum,
     RunningFigures,
 )
-from hilctl.live.scope import Scope, Traces, traces_of
+from hilctl.live.scope import SIGNALS, WINDOWS_S, Scope, Traces, traces_of
 from hilctl.run.control.client import active_runs
 from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import RunFolder
@@ -239,3 +244,85 @@ class RunList:
             return self._main
         chosen = self._chosen(self.runs)
         return self._main if chosen is None else chosen.card.name
+
+
+ScopeMode: TypeAlias = Literal["roll", "cycle"]
+
+
+def nearest_window_s(wanted_s: float) -> float:
+    """Return the value of :data:`hilctl.live.scope.WINDOWS_S` with the nearest ratio."""
+    return min(WINDOWS_S, key=lambda each: max(each / wanted_s, wanted_s / each))
+
+
+def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
+    """Return the current frame of a page; without a cycle, mode ``cycle`` rolls.
+
+    The length of a rolling window is one of :data:`hilctl.live.scope.WINDOWS_S`. A frame is::
+
+        uint32 little endian   size of the JSON in bytes, with spaces up to a multiple of 4
+        JSON                   ``mode``, ``n`` buckets, number of ``signals``, ``loop`` points of
+                               the loops, ``cycle`` points per cycle
+        float32 little endian  t_s[n], low[signals, n], high[signals, n], input[loop], output[loop]
+    """
+    cycles = scope.triggered() if mode == "cycle" else None
+    window, loops = cycles or scope.rolling(window_s), scope.loops()
+    facts = {
+        "mode": "cycle" if cycles else "roll",
+        "n": window.t_s.size,
+        "signals": len(SIGNALS),
+        "loop": loops.shape[1],
+        "cycle": scope.points_a_cycle(),
+    }
+    header = json.dumps(facts).encode()
+    header += b" " * (-len(header) % 4)
+    parts = (window.t_s, window.buckets.low, window.buckets.high, loops)
+    values = np.concatenate([np.ravel(part) for part in parts]).astype("<f4")
+    return struct.pack("<I", len(header)) + header + values.tobytes()
+
+
+@dataclass(frozen=True, slots=True)
+class RunFrame:
+    """State of a run at one time.
+
+    Attributes:
+        status: Metrics, limits, lateness; see :meth:`RunReader.status`.
+        events: Events since the previous frame.
+        t_s: float64[n], start of each bucket of samples; 0 for the newest.
+        low: Minimum of each bucket by signal, float64[n]; NaN if there is no value.
+        high: Maximum of each bucket by signal.
+    """
+
+    status: dict[str, Any]
+    events: list[Event]
+    t_s: F64
+    low: dict[str, F64]
+    high: dict[str, F64]
+
+
+def frames_of(
+    feed: RunReader,
+    every_s: float,
+    window_s: float,
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+) -> Iterator[RunFrame]:
+    """Yield frames of a run until it ends; the last follows its end.
+
+    A late frame delays the following ones. The available window that is nearest to ``window_s`` is
+    used. The clock is monotonic time in s.
+    """
+    window_s, seen = nearest_window_s(window_s), 0
+    while True:
+        began_s = clock()
+        feed.poll(began_s)
+        ended = feed.ended
+        events, seen = feed.events_since(seen)
+        window = feed.scope.rolling(window_s)
+        low, high = (
+            {signal.name: values[row] for row, signal in enumerate(SIGNALS)}
+            for values in (window.buckets.low, window.buckets.high)
+        )
+        yield RunFrame(feed.status(), events, window.t_s, low, high)
+        if ended:
+            return
+        sleep(max(0.0, began_s + every_s - clock()))

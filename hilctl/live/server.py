@@ -39,8 +39,7 @@ from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl.base.formatting import finite_json, printable
 from hilctl.base.strict import StrictModel
-from hilctl.live.frame_codec import ScopeMode, frame_of, nearest_window_s
-from hilctl.live.run_reader import RunList, RunReader
+from hilctl.live.run_reader import RunList, RunReader, ScopeMode, frame_of, nearest_window_s
 from hilctl.live.scope import SIGNALS
 from hilctl.run.control.client import ask, request_stop
 from hilctl.run.run_folder import RunFolder

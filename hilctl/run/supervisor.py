@@ -25,8 +25,7 @@ from hilctl.loop.pacer import deadline_misses
 from hilctl.loop.safe_output import LoopOutcome, describe
 from hilctl.machine.rt_setup import be_ordinary, favoured
 from hilctl.run.control.client import HANG_UP, JOB_CONTROL, STOP_SIGNAL
-from hilctl.run.control.control_socket import ControlServer
-from hilctl.run.control.requests import Requests
+from hilctl.run.control.requests import ControlServer, Requests
 from hilctl.run.job import Job
 from hilctl.run.metadata import RunDescription
 from hilctl.run.processes import GuardianProcess, GuardianRelief, LoopProcess

@@ -1,30 +1,174 @@
-"""Requests to a running supervisor: status, changes of the reference, marks.
+"""Requests to a running supervisor: its socket; status, changes of the reference, marks.
+
+A connection carries one request and one answer, each one line of JSON. Each client has a thread of
+its own, so an answer may take its time. Clients that send nothing are dropped after half a second.
 
 A change of gain, offset or inverse is checked by a bound on the amplitude. It waits until the loop
 has taken the previous one, so none is overwritten.
 """
 
+import json
+import logging
 import math
+import os
+import socketserver
 import threading
 import time
 from collections.abc import Callable, Mapping
+from contextlib import suppress
 from dataclasses import replace
-from typing import Annotated, Any, Literal
+from pathlib import Path
+from typing import Annotated, Any, Literal, Self
 
 import numpy as np
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
-from hilctl.base.errors import InputError
+from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import MARK, Event
+from hilctl.base.private_dirs import private_folder
 from hilctl.base.strict import StrictModel
 from hilctl.experiment.forecast import fade_refusal
 from hilctl.experiment.preflight import CheckedExperiment, command_problems, reference_problems
 from hilctl.loop.compensator import Compensator
-from hilctl.run.control.client import MAX_MARK, InverseState
+from hilctl.run.control.client import (
+    MAX_BYTES,
+    MAX_MARK,
+    VERSION,
+    VERSION_KEY,
+    InverseState,
+    is_same_user,
+    short_path,
+)
 from hilctl.run.recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, facts_of
 from hilctl.run.shared.shared_page import PageField, Phase, SharedPage
-from hilctl.run.shared.shared_page import PageField as Number
+
+_log = logging.getLogger(__name__)
+
+_MAX_CLIENTS = 64
+_BACKLOG = 256
+_REQUEST_S = 0.5
+_ACCEPT_S = 0.05
+
+Answer = Callable[[bytes], Mapping[str, Any]]
+"""Answer a request; an InputError becomes a refusal. It is called from several threads."""
+
+
+class ControlServer:
+    """Serve a socket that only its owner may use."""
+
+    def __init__(self, path: Path, answer: Answer, request_s: float = _REQUEST_S) -> None:
+        self._path, self._answer, self._request_s = path, answer, request_s
+        self._server = _Server(path, answer, request_s)
+        self._closing = threading.Event()
+        self._thread = threading.Thread(target=self._serve, name="control", daemon=True)
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_error: object) -> None:
+        self._closing.set()
+        if self._thread.ident is not None:
+            self._thread.join()
+        self._server.server_close()
+
+    def start(self) -> None:
+        """Start to answer; earlier requests have waited."""
+        self._thread.start()
+
+    def _serve(self) -> None:
+        while not self._closing.is_set():
+            self._restore_socket()
+            self._server.handle_request()
+
+    def _restore_socket(self) -> None:
+        """Listen again at the same path if the socket or its folder was removed."""
+        folder = self._path.parent
+        with suppress(OSError, RunError):  # retried at the next poll
+            if self._path.exists():
+                return
+            private_folder(private_folder(folder.parent) / folder.name)
+            server = _Server(self._path, self._answer, self._request_s)
+            self._server.server_close()
+            self._server = server
+
+
+class _Server(socketserver.ThreadingUnixStreamServer):
+    daemon_threads = True
+    request_queue_size = _BACKLOG
+    timeout = _ACCEPT_S
+
+    def __init__(self, path: Path, answer: Answer, request_s: float) -> None:
+        self.answer, self.request_s = answer, request_s
+        self._path = path
+        self._free = threading.BoundedSemaphore(_MAX_CLIENTS)
+        try:
+            super().__init__(str(path), _Handler)
+        except OSError as error:
+            raise RunError(f"{path}: can't listen: {error.strerror or error}") from None
+
+    def server_bind(self) -> None:
+        # Not chmod after bind: for that moment others could connect.
+        before = os.umask(0o177)
+        try:
+            with short_path(self._path) as short:
+                self.socket.bind(short)
+        finally:
+            os.umask(before)
+
+    def verify_request(self, request: Any, client_address: Any) -> bool:
+        return is_same_user(request)
+
+    def process_request(self, request: Any, client_address: Any) -> None:
+        self._free.acquire()  # other clients wait in the queue of the socket
+        try:
+            super().process_request(request, client_address)
+        except RuntimeError:  # the thread cannot be started
+            self._free.release()
+            raise
+
+    def process_request_thread(self, request: Any, client_address: Any) -> None:
+        try:
+            super().process_request_thread(request, client_address)
+        finally:
+            self._free.release()
+
+    def handle_error(self, request: Any, client_address: Any) -> None:
+        _log.exception("a control request failed")
+
+
+class _Handler(socketserver.BaseRequestHandler):
+    server: _Server
+
+    def handle(self) -> None:
+        with suppress(OSError):  # a client that is slow or has left gets no answer
+            if (line := self._read_line()) is not None:
+                self.request.settimeout(self.server.request_s)
+                self.request.sendall(self._answer(line))
+
+    def _read_line(self) -> bytes | None:
+        """Return the request; None if the client has sent nothing."""
+        deadline = time.monotonic() + self.server.request_s
+        read = bytearray()
+        while b"\n" not in read and len(read) <= MAX_BYTES:
+            left_s = deadline - time.monotonic()
+            if left_s <= 0.0:
+                raise TimeoutError
+            self.request.settimeout(left_s)
+            if not (data := self.request.recv(MAX_BYTES)):
+                break
+            read += data
+        return bytes(read).partition(b"\n")[0] if read else None
+
+    def _answer(self, line: bytes) -> bytes:
+        answer: dict[str, Any] = {"ok": False, "error": f"longer than {MAX_BYTES} bytes"}
+        if len(line) <= MAX_BYTES:
+            try:
+                answer = {"ok": True, **self.server.answer(line)}
+            except InputError as error:
+                answer = {"ok": False, "error": str(error)}
+        return json.dumps({VERSION_KEY: VERSION, **answer}).encode() + b"\n"
+
 
 _SHARES: dict[str | None, float] = {"in": 1.0, "out": 0.0}
 _MOST_WAITING = 16
@@ -255,25 +399,25 @@ class Requests:
         if not self._recording.takes_marks:
             raise InputError("mark: the recording accepts none now, or has ended")
         page = self._page
-        sample = page.get(Number.WAVEFORM_AT) + page.get(Number.NEXT_SAMPLE)
+        sample = page.get(PageField.WAVEFORM_AT) + page.get(PageField.NEXT_SAMPLE)
         self._recording.record_event(Event(sample, "info", MARK, text))
         return {"sample": sample, "text": text}
 
     def _status(self) -> dict[str, Any]:
         page, config = self._page, self._checked.loaded.config
-        phase = Phase(page.get(Number.PHASE)).name.lower()
+        phase = Phase(page.get(PageField.PHASE)).name.lower()
         return {
             **facts_of(self._folder),
-            "state": "stopping" if page.get(Number.STOP) else phase,
-            "sample": page.get(Number.NEXT_SAMPLE),
+            "state": "stopping" if page.get(PageField.STOP) else phase,
+            "sample": page.get(PageField.NEXT_SAMPLE),
             "total_samples": self._checked.forecast.samples,
             "sample_rate_hz": config.sample_rate_hz,
             "recorded_samples": self._recorder.samples,
             "missing_samples": self._recorder.missing,
-            "late_ticks": page.get(Number.LATE_TICKS),
+            "late_ticks": page.get(PageField.LATE_TICKS),
             "gain": self._changes.gain,
             "offset": self._changes.offset,
             "inverse": self._changes.inverse,
             "recording_error": self._recorder.error,
-            "heartbeat_age_s": (time.monotonic_ns() - page.get(Number.LOOP_HEARTBEAT_NS)) * 1e-9,
+            "heartbeat_age_s": (time.monotonic_ns() - page.get(PageField.LOOP_HEARTBEAT_NS)) * 1e-9,
         }

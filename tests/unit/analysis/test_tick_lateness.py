@@ -4,7 +4,7 @@ import numpy as np
 import pytest
 
 from hilctl.analysis import tick_lateness
-from hilctl.analysis.tick_lateness import LatenessBuilder
+from hilctl.analysis.tick_lateness import LatenessBuilder, Quantiles
 from hilctl.recording.recording import Ticks
 
 
@@ -59,3 +59,32 @@ def test_long_runs_are_told_in_longer_stretches() -> None:
     rows = lateness(Ticks(zeros, deadline_ns, zeros, zeros), 500_000.0).by_minute()
     assert len(rows) <= tick_lateness.MOST_ROWS + 1
     assert sum(row["ticks"] for row in rows) == 500_000
+
+
+PERCENTS = [0.0, 10.0, 50.0, 90.0, 99.9]
+VALUES = np.random.default_rng(1).permutation(200_000) * 1e-3
+
+
+def gathered(values, parts=7):
+    found = Quantiles()
+    for part in np.array_split(values, parts):
+        found.add(part)
+    return found
+
+
+def test_few_values_are_exact():
+    found = gathered(VALUES)
+    assert found.percentiles(PERCENTS) == np.percentile(VALUES, PERCENTS).tolist()
+    assert found.median() == np.median(VALUES)
+    assert (found.size, found.largest) == (VALUES.size, VALUES.max())
+    assert found.above(150.0) == np.count_nonzero(VALUES > 150.0)
+
+
+@pytest.mark.parametrize("parts", [1, 7, 1999])
+def test_percentiles_of_many_values_are_those_of_every_nth(monkeypatch, parts):
+    monkeypatch.setattr(tick_lateness, "MOST_EXACT", 30_000)
+    found = gathered(VALUES, parts)
+    assert found.percentiles(PERCENTS) == np.percentile(VALUES[::8], PERCENTS).tolist()
+    assert found.median() == pytest.approx(100.0, rel=0.02)
+    assert (found.size, found.largest) == (VALUES.size, VALUES.max())
+    assert found.above(150.0) == pytest.approx(50_000, rel=0.02)

@@ -56,7 +56,7 @@ def test_invalid_times_of_frames_are_refused(run, times):
 
 def test_frames_are_those_of_the_run(run, monkeypatch):
     monkeypatch.setattr("hilctl.live.run_reader.RunReader", lambda folder: folder.card.name)
-    monkeypatch.setattr("hilctl.live.frame_codec.frames_of", lambda *given: iter([given]))
+    monkeypatch.setattr("hilctl.live.run_reader.frames_of", lambda *given: iter([given]))
     ((feed, every_s, window_s, clock, sleep),) = run.frames(0.2, 2.0)
     assert (feed, every_s, window_s) == ("sine-7", 0.2, 2.0)
     assert (clock, sleep) == (time.monotonic, time.sleep)

@@ -5,7 +5,6 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.base import table
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.table import Table, TableRows, TextTable, open_table
 
@@ -195,7 +194,7 @@ def test_rows(table, other: str, first: int, last: int | None, found: list[int] 
 
 
 def test_a_table_too_large_is_not_read(table, monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(table, "MAX_TABLE_BYTES", 1_000_000)
+    monkeypatch.setattr("hilctl.base.table.MAX_TABLE_BYTES", 1_000_000)
     with pytest.raises(InputError, match=r"t\.csv: has 2 MB.* 1 MB"):
         table(b"\xff" * 2_000_000)
 
