@@ -1,6 +1,7 @@
 """The table of commands, and what help, status and stop import."""
 
 import os
+import re
 import subprocess
 import sys
 from types import SimpleNamespace
@@ -9,7 +10,7 @@ import pytest
 
 from hilctl import __version__
 from hilctl.base.errors import InputError
-from hilctl.cli.commands import COMMANDS, CommandEntry, load
+from hilctl.cli.commands import COMMANDS, load
 
 MAIN = "from hilctl.cli import main; main()"
 
@@ -21,16 +22,9 @@ def in_a_process(code, *arguments, **environment):
     )  # fmt: skip
 
 
-@pytest.mark.parametrize("name", COMMANDS)
-def test_help_of_every_command_matches_the_table(name):
-    command = load(name)
-    assert command.name == name
-    assert command.help.splitlines()[0] == COMMANDS[name].help
-
-
 @pytest.mark.parametrize("module", ["hilctl_absent.command", "hilctl.cli.devices"])
 def test_missing_command_is_an_input_error(module, monkeypatch):
-    monkeypatch.setitem(COMMANDS, "emulate", CommandEntry(module, "Serve."))
+    monkeypatch.setitem(COMMANDS, "emulate", module)
     with pytest.raises(InputError, match="emulate"):
         load("emulate")
 
@@ -117,7 +111,9 @@ finally:
 
 def test_help_names_every_command(hilctl):
     text = hilctl("--help")[1]
-    assert all(f" {name} " in text for name in COMMANDS)
+    for name in COMMANDS:
+        summary = load(name).help.splitlines()[0]
+        assert re.search(rf"^ +{name} .*{re.escape(summary[:30])}", text, re.MULTILINE), name
 
 
 def test_version(hilctl):
