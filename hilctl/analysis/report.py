@@ -190,8 +190,8 @@ class RunReportBuilder:
         ticks, last = self._ticks, self._last
         return {
             "deadline_misses": tick_lateness.misses(last, ticks.late_ns.size),
-            "skipped_ticks": tick_lateness.counter(last, "skipped_ticks", None),
-            "late_ticks": tick_lateness.counter(last, "late_ticks", ticks.late_ticks()),
+            "skipped_ticks": tick_lateness.counter(last, "skipped_ticks"),
+            "late_ticks": tick_lateness.counter(last, "late_ticks"),
             "lateness_us": tick_lateness.percentiles_us(ticks.late_ns),
             "lateness_by_minute": ticks.by_minute(),
             "exchange_us": tick_lateness.percentiles_us(ticks.exchange_ns),

@@ -93,8 +93,7 @@ class RunReport(RunMetrics):
         sensor_invalid_samples: Samples of the waveform with an invalid displacement.
         reading_age_max_s: Largest age of a reading; None unless the sensor sends unasked.
         lost_readings: Readings of such a sensor that did not arrive.
-        late_ticks: Late ticks counted by the run; if not recorded, ticks later than half a tick
-            period. None if neither is known.
+        late_ticks: Late ticks; None if not recorded.
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of the lateness of ticks;
             empty without ticks.
         lateness_by_minute: The same of each minute, with ``minute`` from 0 and its ``ticks``.

@@ -1,4 +1,4 @@
-"""Percentiles in bounded memory; lateness of ticks, late ticks and missed deadlines."""
+"""Percentiles in bounded memory; lateness of ticks and missed deadlines."""
 
 import math
 from collections.abc import Sequence
@@ -48,11 +48,6 @@ class Quantiles:
         """Return the median of at least one value."""
         return float(np.median(np.concatenate(self._parts)))
 
-    def above(self, threshold: float) -> int:
-        """Count the values above a threshold; of very many, an estimate."""
-        above = sum(int(np.count_nonzero(part > threshold)) for part in self._parts)
-        return min(self.size, above * self._every)
-
 
 MOST_ROWS = 1440
 """Most rows of lateness by minute: the minutes of a day."""
@@ -74,8 +69,7 @@ class LatenessBuilder:
 
     def __init__(self, minutes: float) -> None:
         self._together = 1 + int(minutes) // MOST_ROWS
-        self.late_ns, self.exchange_ns, self._steps = Quantiles(), Quantiles(), Quantiles()
-        self._before: int | None = None
+        self.late_ns, self.exchange_ns = Quantiles(), Quantiles()
         self._rows: list[dict[str, float]] = []
         self._minute, self._of_minute = 0, Quantiles()
 
@@ -85,11 +79,6 @@ class LatenessBuilder:
             return
         self.late_ns.add(ticks.late_ns)
         self.exchange_ns.add(ticks.exchange_ns)
-        if self._steps.size < MOST_EXACT:  # enough for the median
-            before = np.array([] if self._before is None else [self._before], dtype=np.int64)
-            due_ns = np.concatenate((before, ticks.deadline_ns))
-            self._steps.add(due_ns[1:] - due_ns[:-1])
-        self._before = int(ticks.deadline_ns[-1])
         minutes = ticks.deadline_ns // _MINUTE_NS // self._together * self._together
         cuts = np.flatnonzero(np.diff(minutes)) + 1
         parts = np.split(ticks.late_ns, cuts)
@@ -114,10 +103,6 @@ class LatenessBuilder:
         self._end_row()
         return self._rows
 
-    def late_ticks(self) -> int | None:
-        """Count ticks that woke more than half a tick period late; None with fewer than two."""
-        return self.late_ns.above(0.5 * self._steps.median()) if self._steps.size else None
-
 
 def percentiles_us(times_ns: Quantiles) -> dict[str, float]:
     """Return ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` in us; empty without times."""
@@ -140,7 +125,7 @@ def misses(recording: Recording, ticks: int) -> str:
     Raises:
         DataError: A recorded number is invalid.
     """
-    skipped = counter(recording, "skipped_ticks", None) or 0
+    skipped = counter(recording, "skipped_ticks") or 0
     text = recording.run.get("max_missed_share", repr(USUAL_MISSED_SHARE))
     try:
         max_share = float(text)
@@ -150,10 +135,10 @@ def misses(recording: Recording, ticks: int) -> str:
     return deadline_misses(skipped, ticks + skipped, max_share)
 
 
-def counter(recording: Recording, name: str, otherwise: int | None) -> int | None:
-    """Return a counter of the end, or a default; raise DataError if it is not a whole number."""
+def counter(recording: Recording, name: str) -> int | None:
+    """Return a counter of the end, or None; raise DataError if it is not a whole number."""
     if name not in recording.end:
-        return otherwise
+        return None
     try:
         return int(recording.end[name])
     except ValueError:

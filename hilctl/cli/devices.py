@@ -3,7 +3,7 @@
 import math
 from collections.abc import Mapping
 from pathlib import Path
-from typing import Annotated
+from typing import Annotated, Any
 
 import typer
 from rich.console import Group, RenderableType
@@ -15,7 +15,6 @@ from hilctl.cli.options import AsJson, ExperimentFile, Settings, device_names
 from hilctl.cli.output import print_result
 from hilctl.experiment.devices import (
     DeviceDescription,
-    Inventory,
     describe,
     inventory,
     profile_summaries,
@@ -74,7 +73,7 @@ def devices(context: typer.Context, as_json: AsJson = False) -> None:
     if context.invoked_subcommand is not None:
         return
     listed = inventory()
-    print_result(listed.to_mapping(), lambda: print_inventory(listed), as_json=as_json)
+    print_result(listed, lambda: print_inventory(listed), as_json=as_json)
 
 
 @devices_.command()
@@ -138,11 +137,11 @@ def _lateness(latency: Latency) -> RenderableType:
     return Group(listing(title, rows), Text(f"{line} us"))
 
 
-def print_inventory(listed: Inventory) -> None:
+def print_inventory(listed: Mapping[str, Any]) -> None:
     """Print devices, profiles and serial ports."""
-    ports = [(port.path, port.description) for port in listed.serial_ports]
+    ports = [(port["path"], port["description"]) for port in listed["serial_ports"]]
     print_rich(
-        listing("devices", sorted(listed.devices.items())),
+        listing("devices", sorted(listed["devices"].items())),
         listing("profiles", profile_summaries()),
         listing("serial ports", ports) if ports else Text("no serial port found"),
     )

@@ -11,11 +11,10 @@ The guardian imports this module, so it must not import numba.
 from collections.abc import Callable
 from contextlib import suppress
 from dataclasses import asdict, dataclass
-from importlib import import_module
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from hilctl.base.device import Device, VoltageLimit, complete
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
@@ -57,9 +56,8 @@ def device_class(kind: str) -> type[Device]:
     known = known_devices()
     if kind not in known:
         raise InputError(f"unknown device '{kind}' ({did_you_mean(kind, list(known))})")
-    module_name, _, class_name = known[kind].partition(":")
     try:
-        found: type[Device] = getattr(import_module(module_name), class_name)
+        found: type[Device] = resolve_name(known[kind])
         _ = found.Options
     except (ImportError, AttributeError) as error:
         raise InputError(f"cannot load device '{kind}': {error}") from error
@@ -97,9 +95,8 @@ def made_device(document: Document, folder: Path, files: TextFiles) -> Device | 
 
 def shipped_profiles() -> dict[str, str]:
     """Return name and file of every shipped profile; raise InputError without drivers."""
-    module_name, _, name = SHIPPED_PROFILES.partition(":")
     try:
-        shipped = cast("Callable[[], dict[str, Path]]", getattr(import_module(module_name), name))
+        shipped: Callable[[], dict[str, Path]] = resolve_name(SHIPPED_PROFILES)
     except (ImportError, AttributeError) as error:
         raise InputError(f"cannot list the shipped profiles: {error}") from error
     return {profile: str(path) for profile, path in sorted(shipped().items())}
@@ -136,37 +133,19 @@ def _summary(name: str, path: str) -> ProfileSummary:
     return ProfileSummary(name, title, ", ".join(channels), _PROTOCOLS.get(kind, kind))
 
 
-@dataclass(frozen=True, slots=True)
-class SerialPort:
-    """A serial port of this machine."""
+def inventory() -> dict[str, Any]:
+    """Return ``devices``, ``profiles`` and ``serial_ports`` without opening any.
 
-    path: str  # device file; ``/dev/serial/by-id/...`` if it exists, which survives replugging
-    description: str
-
-
-@dataclass(frozen=True, slots=True)
-class Inventory:
-    """Possible values in the device section of an experiment."""
-
-    devices: dict[str, str]
-    profiles: dict[str, str]
-    serial_ports: tuple[SerialPort, ...]
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
-
-
-def inventory() -> Inventory:
-    """List devices, profiles and serial ports without opening any."""
+    The path of a port is that in ``/dev/serial/by-id`` if it exists, which survives replugging.
+    """
     from serial.tools.list_ports import comports
 
     by_id = {str(link.resolve()): str(link) for link in sorted(Path("/dev/serial/by-id").glob("*"))}
-    ports = (
-        SerialPort(by_id.get(port.device, port.device), port.description)
+    ports = [
+        {"path": by_id.get(port.device, port.device), "description": port.description}
         for port in sorted(comports())
-    )
-    return Inventory(known_devices(), shipped_profiles(), tuple(ports))
+    ]
+    return {"devices": known_devices(), "profiles": shipped_profiles(), "serial_ports": ports}
 
 
 @dataclass(frozen=True, slots=True)

@@ -8,8 +8,8 @@ import math
 import os
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
-from importlib import import_module
 from pathlib import Path
+from pkgutil import resolve_name
 from typing import Any
 
 from hilctl.base.device import DeviceInfo
@@ -90,10 +90,9 @@ def starting_device(
     if name not in profiles and not own:
         hint = did_you_mean(name, [*kinds, *profiles])
         raise InputError(f"there is no device or profile '{name}' ({hint})")
-    module, _, function = STARTING_SECTION.partition(":")
     given = dict(each.strip().split("=", 1) for each in settings if "=" in each)
     channels = {key: given[f"device.{key}"] for key in _CHANNELS if f"device.{key}" in given}
-    made = getattr(import_module(module), function)(name, unit, reader, channels)
+    made = resolve_name(STARTING_SECTION)(name, unit, reader, channels)
     section = dict(made.values)
     if own:
         section["profile"] = os.path.relpath(name, folder)

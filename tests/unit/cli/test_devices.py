@@ -8,7 +8,7 @@ import pytest
 from rich.console import Console
 
 from hilctl.cli.devices import print_described, print_inventory, print_probed, render_diagnosis
-from hilctl.experiment.devices import DeviceDescription, DeviceOption, Inventory, SerialPort
+from hilctl.experiment.devices import DeviceDescription, DeviceOption
 from hilctl.machine.diagnosis import Diagnosis
 from hilctl.machine.timer_latency import Latency
 from hilctl.run.probe import Probed
@@ -56,9 +56,11 @@ def test_bars_are_logarithmic():
 
 
 def test_serial_ports_are_listed(capsys):
-    print_inventory(Inventory({"rig": "a:b"}, {"labjack_t7": "x"}, ()))
+    listed = {"devices": {"rig": "a:b"}, "profiles": {"labjack_t7": "x"}}
+    print_inventory({**listed, "serial_ports": []})
     assert "no serial port" in capsys.readouterr().out
-    print_inventory(Inventory({}, {}, (SerialPort("/dev/ttyUSB0", "an adapter"),)))
+    port = {"path": "/dev/ttyUSB0", "description": "an adapter"}
+    print_inventory({**listed, "serial_ports": [port]})
     shown = capsys.readouterr().out
     assert "/dev/ttyUSB0" in shown
     assert "no serial port" not in shown

@@ -167,11 +167,11 @@ def test_device_that_can_not_be_loaded(devices_package, kind, reason):
 def test_devices_profiles_and_ports_are_listed(monkeypatch):
     ports = [SimpleNamespace(device="/dev/ttyX1", description="b")]
     monkeypatch.setattr("serial.tools.list_ports.comports", lambda: ports)
-    found = inventory().to_mapping()
+    found = inventory()
     assert "modbus_dac" in found["devices"]
     assert Path(found["profiles"]["labjack_t7"]).is_file()
     assert list(found["profiles"]) == sorted(found["profiles"])
-    assert found["serial_ports"] == ({"path": "/dev/ttyX1", "description": "b"},)
+    assert found["serial_ports"] == [{"path": "/dev/ttyX1", "description": "b"}]
 
 
 @pytest.mark.parametrize("place", ["no_such_package:shipped", "hilctl_drivers.profile:no_such"])
