@@ -9,7 +9,6 @@ PUBLIC = (
     "plot_style",
     "replay",
     "report",
-    "report_table",
     "run_metrics",
     "response.bode",
     "response.feedback_design",

@@ -7,7 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.analysis import html, loop_plot, plots, report_table
+from hilctl.analysis import html, plots, run_metrics
 from hilctl.analysis.figure_layout import FigureSpec
 from hilctl.analysis.html import definitions_of
 from hilctl.analysis.report import worst_segment
@@ -53,7 +53,7 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
         terms += ["peak and rms error", "harmonics of the error"]
     samples = [
         (name, value)
-        for name, value in report_table.run_rows(report)
+        for name, value in run_metrics.run_rows(report)
         if name not in {"labels", "device", "device description"}
         and value != MISSING
         # The end of an incomplete run is above.
@@ -65,12 +65,12 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
         html.paragraph(report.path, "file"),
         *_end(recording, report),
         html.paragraph(headline(report), "headline"),
-        html.paragraph(f"The device is {report_table.SIMULATED}.", "note")
+        html.paragraph(f"The device is {run_metrics.SIMULATED}.", "note")
         if report.simulated
         else "",
         *_figures(recording, report, before),
         '<div class="side">',
-        html.rows("Results", results) if (results := report_table.quality_rows(report)) else "",
+        html.rows("Results", results) if (results := run_metrics.quality_rows(report)) else "",
         html.rows("Samples and timing", samples),
         html.rows("Run", provenance_rows(recording)),
         "</div>",
@@ -129,7 +129,7 @@ def _figures(recording: Recording, report: RunReport, before: Recording | None) 
         yield html.paragraph("No figure is drawn: readings are near the largest number.")
         return
     sheets = run_sheets(recording, report)
-    if before and (both := loop_plot.before_and_after(before, recording)):
+    if before and (both := plots.before_and_after(before, recording)):
         sheets.insert(0, both)
     yield html.figures(sheets)
 
@@ -140,7 +140,7 @@ def run_sheets(recording: Recording, report: RunReport) -> list[FigureSpec]:
         return []
     focus = worst_segment(report.segments)
     found = (
-        None if _is_fault(recording) else loop_plot.hysteresis_loop(recording, focus),
+        None if _is_fault(recording) else plots.hysteresis_loop(recording, focus),
         plots.step_response(recording, focus),
         plots.response(recording, focus),
         plots.steady_cycles(recording, focus),
@@ -167,7 +167,7 @@ def _segments(report: RunReport) -> list[str]:
     if len(report.segments) < 2:
         return []
     note = html.paragraph("The results above are the worst of these.")
-    headings, rows = report_table.segment_table(report)
+    headings, rows = run_metrics.segment_table(report)
     return ["<h2>By segment</h2>", note, html.grid(headings, rows)]
 
 
@@ -190,7 +190,7 @@ def _rows(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "date", _date(run.get("started", ""))
     for key, value in recording.labels.items():
         yield key, str(value)
-    simulated = f" ({report_table.SIMULATED})" if run.get("simulated") == "true" else ""
+    simulated = f" ({run_metrics.SIMULATED})" if run.get("simulated") == "true" else ""
     yield "device", f"{run.get('device', '')}{simulated}"
     yield "device description", run.get("device_description", "")
     yield "computer", ", ".join(filter(None, (run.get("host", ""), run.get("kernel", ""))))

@@ -20,8 +20,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
-from hilctl.analysis.report_table import quality_rows, run_rows, segment_table
-from hilctl.analysis.run_metrics import RunReport
+from hilctl.analysis.run_metrics import RunReport, quality_rows, run_rows, segment_table
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import adapted_text
 from hilctl.base.formatting import printable, unit_text

@@ -8,7 +8,7 @@ import pytest
 from hilctl.analysis import decimation as module
 from hilctl.analysis import plots
 from hilctl.analysis.decimation import overview
-from hilctl.analysis.loop_plot import hysteresis_loop
+from hilctl.analysis.plots import hysteresis_loop
 from hilctl.analysis.report import summarize
 from hilctl.analysis.run_page import page
 from hilctl.analysis.steady_state import Overview, steady_part, steady_samples

@@ -6,10 +6,16 @@ import numpy as np
 import pytest
 from matplotlib.collections import FillBetweenPolyCollection
 
-from hilctl.analysis import loop_plot, plot_style, plots
+from hilctl.analysis import plot_style, plots
 from hilctl.analysis.figure_layout import drawn
 from hilctl.analysis.html import svg
-from hilctl.analysis.plots import ErrorSpectrum, error_spectrum, thinned
+from hilctl.analysis.plots import (
+    ErrorSpectrum,
+    before_and_after,
+    error_spectrum,
+    hysteresis_loop,
+    thinned,
+)
 from hilctl.base.segments import Segment
 from hilctl.recording.recording import Recording, Ticks
 
@@ -99,7 +105,7 @@ def test_the_response_is_displacement_over_input(make_recording, label, period) 
 class TestHysteresisLoop:
     @pytest.mark.parametrize("compensated", [True, False])
     def test_peak_hysteresis_is_marked_at_its_height(self, run, compensated: bool) -> None:
-        figure = drawn(loop_plot.hysteresis_loop(run(compensated=compensated)))
+        figure = drawn(plots.hysteresis_loop(run(compensated=compensated)))
         for axes in figure.axes:
             assert axes.get_xlabel() == ("reference, µm" if compensated else "command, A")
             label = next(name for name in lines(axes) if name.startswith("peak hysteresis"))
@@ -108,7 +114,7 @@ class TestHysteresisLoop:
             assert height == pytest.approx(80.0 * np.sin(0.1), rel=1e-3)
 
     def test_compensated_run_is_held_against_its_reference(self, run) -> None:
-        right = drawn(loop_plot.hysteresis_loop(run())).axes[1]
+        right = drawn(plots.hysteresis_loop(run())).axes[1]
         x, y = right.get_lines()[0].get_data()
         assert (x[0], y[0]) == (x[-1], y[-1])
         assert np.abs(y).max() == pytest.approx(80.0 * np.sin(0.05), rel=1e-3)
@@ -117,7 +123,7 @@ class TestHysteresisLoop:
         recording = run(cycles=9)
         ends = [(3000 * k, 3000 * k + 3000) for k in range(4)]
         parts = [Segment(f"part {k}", *ends[k], *ends[k], PERIOD) for k in range(4)]
-        figure = drawn(loop_plot.hysteresis_loop(replace(recording, segments=tuple(parts))))
+        figure = drawn(plots.hysteresis_loop(replace(recording, segments=tuple(parts))))
         axes = figure.axes[0]
         shown = {text.get_text() for text in figure.legends[0].get_texts()}
         assert {"part 0", "part 1", "part 2"} <= shown
@@ -127,7 +133,7 @@ class TestHysteresisLoop:
     def test_what_does_not_repeat_is_drawn_as_measured(self, run) -> None:
         recording = run()
         once = replace(recording.segments[0], period=0.0)
-        axes = drawn(loop_plot.hysteresis_loop(replace(recording, segments=(once,)))).axes[0]
+        axes = drawn(plots.hysteresis_loop(replace(recording, segments=(once,)))).axes[0]
         assert axes.get_lines()[0].get_xdata().size == 4000
         assert not any(name.startswith("peak") for name in lines(axes))
         assert "not averaged" in axes.get_title("left")
@@ -172,7 +178,7 @@ class TestLateness:
 def test_every_figure_can_be_drawn(run) -> None:
     recording = run()
     for sheet_of in (
-        plots.time_history, plots.steady_cycles, loop_plot.hysteresis_loop, plots.error,
+        plots.time_history, plots.steady_cycles, plots.hysteresis_loop, plots.error,
         plots.spectrum, plots.lateness,
     ):  # fmt: skip
         assert svg(drawn(sheet_of(recording)), "").startswith("<svg ")
@@ -194,7 +200,7 @@ def test_a_figure_without_data_is_none(run) -> None:
     ticks = Ticks(*(np.empty(0, np.int64),) * 4)
     assert plots.time_history(replace(recording, samples=samples.part(0, 0))) is None
     for more in ({"segments": ()}, {"samples": samples.part(0, 700)}):
-        assert loop_plot.hysteresis_loop(replace(recording, **more)) is None
+        assert plots.hysteresis_loop(replace(recording, **more)) is None
     assert plots.error(plain) is plots.spectrum(plain) is None
     for more in ({"ticks": ticks}, {"run": {"paced": "false"}}):
         assert plots.lateness(replace(recording, **more)) is None
@@ -252,3 +258,48 @@ def test_a_thinned_spectrum_keeps_every_peak():
     x, y = thinned(spectrum, 300)
     assert x.size == y.size <= 300
     assert np.count_nonzero(y == 1.0) == 2
+
+
+SHORT_PERIOD = 500
+
+
+def test_many_loops_are_not_all_named(make_recording):
+    """A legend longer than the figure says nothing: the first, the last and the worst do."""
+    wave_um = 10.0 * np.sin(2.0 * np.pi * np.arange(40 * SHORT_PERIOD) / SHORT_PERIOD)
+
+    def named(count):
+        size = 40 * SHORT_PERIOD // count
+        parts = [
+            Segment(f"part {i}", i * size, (i + 1) * size, i * size, (i + 1) * size, SHORT_PERIOD)
+            for i in range(count)
+        ]
+        recording = make_recording(wave_um, reference_um=wave_um, segments=parts)
+        figure = drawn(hysteresis_loop(recording))
+        return [text.get_text() for text in figure.legends[0].get_texts()]
+
+    assert [name for name in named(4) if "part" in name] == [f"part {i}" for i in range(4)]
+    assert [name for name in named(20) if "part" in name] == ["part 0", "part 19"]
+
+
+def test_before_and_after_are_drawn_over_their_own_ranges(make_recording):
+    """Command and reference have different units; both go from corner to corner."""
+    phase = 2.0 * np.pi * np.arange(4 * SHORT_PERIOD) / SHORT_PERIOD
+    part = [Segment("sine", 0, 4 * SHORT_PERIOD, 0, 4 * SHORT_PERIOD, SHORT_PERIOD)]
+    before = make_recording(40.0 * np.sin(phase - 0.3), command=6.0 * np.sin(phase), segments=part)
+    wave_um = 40.0 * np.sin(phase)
+    after = make_recording(wave_um, reference_um=wave_um, segments=part)
+    left, right = drawn(before_and_after(before, after)).axes
+    for line in left.lines[:2]:
+        assert (line.get_ydata().min(), line.get_ydata().max()) == pytest.approx((0.0, 100.0))
+    assert np.ptp(right.lines[0].get_ydata()) == pytest.approx(100.0 * np.sin(0.3), rel=0.02)
+    assert np.ptp(right.lines[1].get_ydata()) == pytest.approx(0.0, abs=1e-9)
+    assert before_and_after(make_recording(wave_um), after) is None
+
+
+def test_a_command_that_stands_has_a_level_line(make_recording):
+    part = Segment("constant", 0, 1000, 0, 1000, 0.0)
+    displacement_um = np.linspace(1.0, 3.0, 1000)
+    recording = make_recording(displacement_um, command=np.full(1000, 2.0), segments=[part])
+    figure = drawn(hysteresis_loop(recording))
+    off_the_line = figure.axes[1].lines[0].get_ydata()
+    np.testing.assert_allclose(off_the_line, displacement_um - 2.0)

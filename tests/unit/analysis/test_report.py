@@ -10,8 +10,7 @@ import numpy as np
 import pytest
 
 from hilctl.analysis.report import SegmentReportBuilder, processes_of, summarize, worst_segment
-from hilctl.analysis.report_table import run_rows
-from hilctl.analysis.run_metrics import RunReport
+from hilctl.analysis.run_metrics import RunReport, run_rows
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, LOST_READINGS, MARK, TUNED, Event
 from hilctl.base.samples import Flag

@@ -8,6 +8,8 @@ from pathlib import Path
 import pytest
 
 from hilctl.analysis.report import summarize
+from hilctl.analysis.run_metrics import quality_rows, run_rows, segment_table, usage_text
+from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.reader import read
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_compensated.mcap"
@@ -25,3 +27,56 @@ def test_what_is_not_finite_becomes_null(value):
     assert plain["segments"][0]["peak_error_percent"] is None
     assert plain["lateness_us"] == {"p50": None, "max": 3.0}
     assert plain["samples"] == report.samples
+
+
+@pytest.fixture
+def report():
+    return summarize(read(GOLDEN))
+
+
+def test_unknown_figures_are_dashes(report):
+    unknown = replace(
+        report, command_min=None, command_max=None, late_ticks=None, skipped_ticks=None,
+        lateness_us={}, device="", reason="", simulated=False, complete=True,
+    )  # fmt: skip
+    rows = dict(run_rows(unknown))
+    assert rows["command"] == "-"
+    assert rows["ticks"] == "- late, - skipped"
+    assert rows["lateness"] == "-"
+    assert "timing" not in rows
+    assert dict(run_rows(replace(report, deadline_misses="3 of 5")))["timing"] == "3 of 5"
+    assert (rows["device"], rows["ended"]) == ("-", "-")
+    assert dict(run_rows(replace(report, device_description="X 1")))["device description"] == "X 1"
+    assert dict(run_rows(replace(unknown, complete=False)))["ended"] == "- (NOT complete)"
+
+
+def test_uncompensated_runs_have_no_errors(report):
+    assert any("error" in name for name, _ in quality_rows(report))
+    plain = summarize(read(GOLDEN / "terfenol_uncompensated.mcap"))
+    assert not any("error" in name for name, _ in quality_rows(plain))
+
+
+def test_metrics_without_a_value_have_no_row(report):
+    unknown = replace(report, peak_hysteresis_percent=None, loop_area=None, steady_cycles=0)
+    assert dict(quality_rows(report)).keys() - dict(quality_rows(unknown)).keys() == {
+        "peak hysteresis",
+        "loop area",
+        "steady cycles",
+    }
+
+
+def test_columns_that_are_empty_everywhere_are_left_out(report):
+    segment = report.segments[0]
+    blank = replace(segment, frequency_hz=None)
+    headings, rows = segment_table(replace(report, segments=(segment, blank)))
+    assert "freq. Hz" in headings
+    assert rows[1][headings.index("freq. Hz")] == "-"
+    headings, rows = segment_table(replace(report, segments=(blank,)))
+    assert "freq. Hz" not in headings
+    assert len(rows[0]) == len(headings)
+
+
+def test_people_read_megabytes_and_seconds():
+    text = usage_text(ProcessUsage(98_000_000, 1_500_000_000, 12, 3, 1234))
+    for part in ("98 MB", "1.50 s", "15 ", "3 from", "1,234 "):
+        assert part in text
