@@ -16,6 +16,7 @@ from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, CHANGES, LOST_READINGS, MARK, Event
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
+from hilctl.base.strict import first_problem
 from hilctl.base.types import F64, I64
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import USAGE_FACT
@@ -270,9 +271,7 @@ def processes_of(recording: Recording) -> dict[str, ProcessUsage]:
     try:
         found = _PROCESSES.validate_json(recording.end.get(USAGE_FACT, "{}"))
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        place = ".".join(str(part) for part in first["loc"])
-        raise DataError(f"{where}: {place}: {first['msg']}") from None
+        raise DataError(f"{where}: {first_problem(error)}") from None
     if any(not 0 <= value < _USAGE_LIMIT for each in found.values() for value in astuple(each)):
         raise DataError(f"{where}: every number must be in [0, 2^63)")
     return {str(name): usage for name, usage in found.items()}

@@ -20,8 +20,14 @@ from pydantic import (
 __all__ = [
     "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "StrictModel",
     "StringConstraints", "ValidationError", "ValidationInfo", "WithJsonSchema", "field_validator",
-    "model_validator",
+    "first_problem", "model_validator",
 ]  # fmt: skip
+
+
+def first_problem(error: ValidationError, whole: str = "message") -> str:
+    """Return the place and text of the first problem; ``whole`` names the place of all data."""
+    first = error.errors(include_url=False, include_input=False)[0]
+    return f"{'.'.join(map(str, first['loc'])) or whole}: {first['msg']}"
 
 
 class StrictModel(BaseModel):

@@ -12,7 +12,6 @@ Encoding, separator, decimal mark, preamble, names and units of a text table are
 
 import csv
 import re
-import warnings
 from abc import ABC, abstractmethod
 from array import array
 from collections import Counter
@@ -303,11 +302,10 @@ class TextTable(Table):
         """Return the cells of a line; none if it is no row of a table."""
         if len(line) > _LONGEST_LINE:
             return []
-        return _split(self._bare(line), self._separator)
-
-    def _bare(self, line: str) -> str:
-        """Return a line without the separator that ends each row."""
-        return line.removesuffix(self._separator) if self._trailing else line
+        # A separator may end each row.
+        return _split(
+            line.removesuffix(self._separator) if self._trailing else line, self._separator
+        )
 
     def _is_data(self, cells: list[str], numeric: Sequence[int]) -> bool:
         return len(cells) == self._count and all(
@@ -328,22 +326,14 @@ class TextTable(Table):
     def read(
         self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None
     ) -> TableRows:
-        """Read some columns of some rows; other cells may have any content.
-
-        Args:
-            columns: Their indices from 0.
-            first_row: First row of data, counted from 1.
-            last_row: Last row; None for all.
+        """Read some columns of some rows, see :meth:`Table.read`; other cells may have any content.
 
         Raises:
-            DataError: Rows are missing, a row is longer or shorter than the others, or a value is
-                not a finite number; names the line.
+            DataError: Also if a row is longer or shorter than the others; names the line.
         """
         check_rows(self.path, len(self._rows), first_row, last_row)
         rows = self._rows[first_row - 1 : last_row]
-        table = self._whole(rows, columns)
-        if table is None:
-            table = self._careful(rows, columns)
+        table = self._values(rows, columns)
         lines = np.array([number for number, _ in rows])
         bad = np.argwhere(~np.isfinite(table))
         if bad.size:
@@ -354,25 +344,8 @@ class TextTable(Table):
             raise DataError(f"{self._place(lines[row], columns[column])}: {text}")
         return TableRows(self.path, np.ascontiguousarray(table.T), lines)
 
-    def _whole(self, rows: list[tuple[int, str]], columns: Sequence[int]) -> F64 | None:
-        """Read a purely numeric table, three times as fast; None for any other."""
-        lines = (self._bare(line) for _, line in rows)
-        if self._comma:
-            if any("." in line for _, line in rows):
-                return None
-            lines = (line.replace(",", ".") for line in lines)
-        delimiter = None if self._separator == " " else self._separator
-        try:
-            with warnings.catch_warnings(action="error"):
-                table = np.loadtxt(
-                    lines, delimiter=delimiter, comments=None, quotechar='"', ndmin=2
-                )
-        except (ValueError, UserWarning):
-            return None
-        return table[:, columns] if table.shape[1] == self._count else None
-
-    def _careful(self, rows: list[tuple[int, str]], columns: Sequence[int]) -> F64:
-        """Read row by row, and name the invalid one."""
+    def _values(self, rows: list[tuple[int, str]], columns: Sequence[int]) -> F64:
+        """Return the values, float64[rows, columns]; raise DataError at the first invalid one."""
         values = array("d")
         for number, line in rows:
             cells = self.cells(line)

@@ -38,7 +38,7 @@ from websockets.typing import Subprotocol
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl.base.formatting import finite_json, printable
-from hilctl.base.strict import StrictModel
+from hilctl.base.strict import StrictModel, first_problem
 from hilctl.live.run_reader import RunList, RunReader, ScopeMode, frame_of, nearest_window_s
 from hilctl.live.scope import SIGNALS
 from hilctl.run.control.client import ask, request_stop
@@ -123,8 +123,7 @@ class PageSession:
                 try:
                     self.view = PageView.model_validate(message.view)
                 except ValidationError as error:
-                    first = error.errors(include_url=False, include_input=False)[0]
-                    text = f"{'.'.join(map(str, first['loc']))}: {first['msg']}"
+                    text = first_problem(error)
                     await self._connection.send(answer_text(message, ok=False, error=text))
                     continue
             await self._connection.send(await self._answer(self, message))

@@ -26,7 +26,7 @@ from hilctl.base.samples import (
     BlockHeader,
 )
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
-from hilctl.base.strict import StrictModel
+from hilctl.base.strict import StrictModel, first_problem
 from hilctl.base.types import CommandUnit
 from hilctl.recording import schema
 from hilctl.recording.codec import BlockArrays, decode_block, decode_ticks
@@ -294,9 +294,7 @@ def segments_of(text: str) -> tuple[Segment, ...]:
     try:
         recorded = _SEGMENTS.validate_json(text)
     except ValidationError as error:
-        first = error.errors(include_url=False, include_input=False)[0]
-        where = ".".join(map(str, first["loc"])) or "the text"
-        raise ValueError(f"segments: {where}: {first['msg']}") from None
+        raise ValueError(f"segments: {first_problem(error, 'the text')}") from None
     segments = tuple(Segment(**each.model_dump()) for each in recorded)
     end = 0
     for number, each in enumerate(segments):

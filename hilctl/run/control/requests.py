@@ -26,7 +26,7 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import MARK, Event
 from hilctl.base.private_dirs import private_folder
-from hilctl.base.strict import StrictModel
+from hilctl.base.strict import StrictModel, first_problem
 from hilctl.experiment.forecast import fade_refusal
 from hilctl.experiment.preflight import CheckedExperiment, command_problems, reference_problems
 from hilctl.loop.compensator import Compensator
@@ -386,9 +386,7 @@ class Requests:
         try:
             request = REQUESTS.validate_json(line)
         except ValidationError as error:
-            first = error.errors(include_url=False, include_input=False)[0]
-            where = ".".join(str(part) for part in first["loc"]) or "message"
-            raise InputError(f"{where}: {first['msg']}") from None
+            raise InputError(first_problem(error)) from None
         if isinstance(request, StatusRequest):
             return self._status()
         if isinstance(request, MarkRequest):

@@ -52,7 +52,7 @@ def test_unknown_figures_are_dashes(report):
 
 def test_uncompensated_runs_have_no_errors(report):
     assert any("error" in name for name, _ in quality_rows(report))
-    plain = summarize(read(GOLDEN / "terfenol_uncompensated.mcap"))
+    plain = summarize(read(GOLDEN.with_name("terfenol_uncompensated.mcap")))
     assert not any("error" in name for name, _ in quality_rows(plain))
 
 
