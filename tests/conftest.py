@@ -14,8 +14,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+from hilctl.base import yaml
 from hilctl.base.private_dirs import memory_folder
-from hilctl.base.yaml import io
 from hilctl.experiment import devices as registry
 from hilctl.kernels.jit import ensure_compiled
 from hilctl.run.processes import signal_guardian
@@ -130,7 +130,7 @@ def caplog():
 @pytest.fixture(scope="session", autouse=True)
 def read_once():
     """Read each YAML text, each profile and the entry points once; they do not change."""
-    readers = ((io, "compose"), (profile, "parse_profile"), (registry, "entry_points"))
+    readers = ((yaml, "compose"), (profile, "parse_profile"), (registry, "entry_points"))
     with pytest.MonkeyPatch.context() as patch:
         for module, name in readers:
             patch.setattr(module, name, lru_cache(maxsize=256)(getattr(module, name)))

@@ -12,7 +12,7 @@ segments.py    segments of a run and their steady cycles
 formatting.py  numbers with units, printable texts, JSON
 calibration.py  calibration files of sensor and amplifier
 table.py       tables of numbers: text, NumPy, MATLAB, Parquet
-yaml/          strict YAML with the line of every value
+yaml.py        strict YAML with the line of every value
 
 A device in another package needs ``Device``, ``DeviceInfo``, ``DeviceOptions``, ``DeviceError`` and
 ``UnconfirmedError`` only.

@@ -14,7 +14,7 @@ from hypothesis import given
 from hypothesis import strategies as st
 
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
-from hilctl.base.yaml import Document, dump, io
+from hilctl.base.yaml import Document, dump
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 from hilctl.models.model_file import dump_model, load_model, parse_model
@@ -213,7 +213,7 @@ def test_dumped_text_is_as_people_write_it():
     ("a: &x [1]\nb: [" + "*x," * 9 + "]", "aliases"),
 ])  # fmt: skip
 def test_too_much_is_refused_at_once(text, rule, monkeypatch):
-    monkeypatch.setattr(io, "MAX_VALUES", 500)
+    monkeypatch.setattr("hilctl.base.yaml.MAX_VALUES", 500)
     with pytest.raises(ConfigError, match=rule):
         Document("large.yaml", text)
 
