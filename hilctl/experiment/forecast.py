@@ -93,20 +93,21 @@ def forecast_of(
     if begun.state is not None:
         compensator.restore(begun.state)
     heat_a2 = max(heat_a2, config.safe.value**2)
-    figures = _RunFigures(config, heat_a2)
+    command, ends = CommandFigures(config, config.safe.value, heat_a2), LineEnds()
     if conditioned.size:
-        figures.command.add(conditioned)
+        command.add(conditioned)
     values = reference.values
     simulate_commands(
         compensator,
         input_um or (lambda start, stop: begun.input_um[start:stop]),
         lambda start, stop: values[start:stop],
         values.size,
-        figures,
+        command,
+        ends,
         reference.repeats,
     )
     low, high = reference.span
-    command, heat = figures.command, figures.command.heat
+    heat = command.heat
     lowest_at_s, highest_at_s, fastest_at_s, voltage_at_s = command.places_s
     return Forecast(
         samples=values.size,
@@ -131,8 +132,8 @@ def forecast_of(
         recording_mb=_recording_bytes(config, reference, conditioned.size) * 1e-6,
         highest_rate_hz=info.max_rate_hz,
         rate_note=info.rate_note,
-        first_command=figures.first,
-        line=None if loaded.model is None else figures.ends.line(),
+        first_command=ends.first,
+        line=None if loaded.model is None else ends.line(),
     )
 
 
@@ -161,7 +162,8 @@ def simulate_commands(
     input_um: Callable[[int, int], F64],
     reference: Callable[[int, int], F64],
     size: int,
-    figures: "_RunFigures",
+    figures: "CommandFigures",
+    ends: "LineEnds",
     repeats: tuple[RepeatedPart, ...],
 ) -> None:
     """Simulate the commands of a run, without the repeats of cycles that agree.
@@ -179,7 +181,8 @@ def simulate_commands(
             start, at = at, min(at + CHUNK, stop)
             command = np.empty(at - start)
             compensator.process(input_um(start, at), command)
-            figures.add(reference(start, at), command)
+            figures.add(command)
+            ends.add(reference(start, at), command)
             if cycle is not None:
                 cycle[start - begins : at - begins] = command
 
@@ -190,13 +193,13 @@ def simulate_commands(
         cycle = whole_cycle(repeat.period, stop - repeat.start)
         before, now = np.full((2, cycle), math.nan)
         while cycle and stop - at >= 3 * cycle:
-            figures.mark()
+            before_a2 = figures.heat.heat_a2
             advance(at + cycle, now)
             times = (stop - at) // cycle - 1
             with np.errstate(over="ignore", invalid="ignore"):  # NaN never agrees
                 same = bool(np.abs(now - before).max() * times <= _SAME * np.ptp(now))
             if same:
-                figures.skip(cycle, times)
+                figures.skip(before_a2, cycle, times)
                 at += times * cycle
                 break
             before, now = now, before
@@ -286,31 +289,6 @@ class CommandFigures:
         return self._step * self._rate_hz
 
 
-class _RunFigures:
-    """Consumer of the simulated commands of a forecast."""
-
-    def __init__(self, config: Experiment, heat_a2: float) -> None:
-        self.command = CommandFigures(config, config.safe.value, heat_a2)
-        self.ends = LineEnds()
-        self.first = math.nan
-        self._marked_a2 = 0.0
-
-    def add(self, reference: F64, command: F64) -> None:
-        """Add the next samples: float64[n] each, n > 0."""
-        if math.isnan(self.first):
-            self.first = float(command[0])
-        self.command.add(command)
-        self.ends.add(reference, command)
-
-    def mark(self) -> None:
-        """Mark the start of a cycle."""
-        self._marked_a2 = self.command.heat.heat_a2
-
-    def skip(self, samples: int, times: int) -> None:
-        """Add the cycle since the mark, of ``samples`` samples, ``times`` more times."""
-        self.command.skip(self._marked_a2, samples, times)
-
-
 class LineEnds:
     """Collects the ends of the line that replaces the inverse while it is bypassed.
 
@@ -319,11 +297,14 @@ class LineEnds:
     """
 
     def __init__(self) -> None:
+        self.first = math.nan
+        """The first command."""
         self._low, self._high = (math.inf, math.nan), (-math.inf, math.nan)
         self._lowest, self._highest = math.inf, -math.inf
 
     def add(self, reference: F64, command: F64) -> None:
         """Add the next samples: float64[n] each, n > 0."""
+        self.first = float(command[0]) if math.isnan(self.first) else self.first
         low, high = int(reference.argmin()), int(reference.argmax())
         self._low = min(self._low, (float(reference[low]), float(command[low])))
         self._high = max(self._high, (float(reference[high]), float(command[high])))

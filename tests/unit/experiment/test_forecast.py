@@ -98,16 +98,15 @@ MODELS = {"rdpi": terfenol_rdpi(), "staged": load_model(MODEL.parent / "terfenol
 class Counter:
     """Figures that count what they are given."""
 
+    heat = SimpleNamespace(heat_a2=0.0)
+
     def __init__(self):
         self.samples = self.passed = 0
 
-    def add(self, reference, command):
+    def add(self, command):
         self.samples += command.size
 
-    def mark(self):
-        pass
-
-    def skip(self, samples, times):
+    def skip(self, before_a2, samples, times):
         self.passed += samples * times
 
 
@@ -143,7 +142,7 @@ def gone_through(period, n, command_of=None):
         return np.asarray(reference(np.arange(start, stop, dtype=np.float64)))
 
     repeats = (RepeatedPart(1000, n - 1000, period),)
-    simulate_commands(Compensator(None, 1000.0), part, part, n, counted, repeats)
+    simulate_commands(Compensator(None, 1000.0), part, part, n, counted, LineEnds(), repeats)
     return counted
 
 
