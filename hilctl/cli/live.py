@@ -25,7 +25,7 @@ from hilctl.cli.options import AsJson, run_names
 from hilctl.cli.output import print_json, safe_streams
 from hilctl.live.run_reader import RunList, RunReader
 from hilctl.live.scope import ROW, WINDOWS_S
-from hilctl.live.server_process import SingleRun, serve_foxglove, serve_runs
+from hilctl.live.server_process import SingleRun, serve_runs
 from hilctl.run.control.client import (
     JOB_CONTROL,
     MAX_MARK,
@@ -290,10 +290,7 @@ def live(
         what = "Foxglove server" if foxglove else "live page"
         print_json({"url": url}) if as_json else print(f"{what}: {url}", flush=True)
 
-    if foxglove:
-        serve_foxglove(chosen, over, on_url, port)
-    else:
-        serve_runs(chosen, over, on_url, port or 0)
+    serve_runs(chosen, over, on_url, port, foxglove=foxglove)
 
 
 if __name__ == "__main__":

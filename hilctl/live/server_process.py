@@ -47,47 +47,34 @@ def serve_runs(
     chosen: Callable[[list[RunFolder]], RunFolder | None],
     over: Callable[[RunList], bool],
     on_url: Callable[[str], None],
-    port: int = 0,
+    port: int | None = None,
+    *,
+    foxglove: bool = False,
 ) -> None:
-    """Serve the page until ``over`` returns true.
+    """Serve the page, or Foxglove and compatible applications, until ``over`` returns true.
 
     Args:
         chosen: Returns the run that a page shows by default.
         over: Returns whether to end the server.
         on_url: Called with the address of the page, including its token.
-        port: Port to listen on; 0 for any.
+        port: Port to listen on; None for any, and for the default port of the applications.
+        foxglove: Serve Foxglove instead of the page.
 
     Raises:
+        InputError: The library of Foxglove is not installed.
         RunError: The port is not available.
     """
-    _come_last()
-    server = LiveServer(chosen, port)
-    on_url(server.url)
-    asyncio.run(server.run(over))
-
-
-def serve_foxglove(
-    chosen: Callable[[list[RunFolder]], RunFolder | None],
-    over: Callable[[RunList], bool],
-    on_url: Callable[[str], None],
-    port: int | None = None,
-) -> None:
-    """Serve runs to Foxglove like :func:`serve_runs`, on the applications' default port if None.
-
-    Raises:
-        InputError: The library is not installed.
-        RunError: The port is not available.
-    """
-    _come_last()  # before the library starts threads, which inherit the priority
-    server = FoxgloveServer(chosen, PORT if port is None else port)
-    on_url(server.url)
-    server.run(over)
-
-
-def _come_last() -> None:
-    """Lower the priority of this process below that of loop, recorder and guardian."""
+    # Below loop, recorder and guardian; before a library starts threads, which inherit it.
     be_ordinary()
     os.nice(_NICE)
+    if foxglove:
+        applications = FoxgloveServer(chosen, PORT if port is None else port)
+        on_url(applications.url)
+        applications.run(over)
+    else:
+        page = LiveServer(chosen, port or 0)
+        on_url(page.url)
+        asyncio.run(page.run(over))
 
 
 @contextmanager

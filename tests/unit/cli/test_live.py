@@ -348,15 +348,11 @@ def served(monkeypatch):
     """Replace the servers; return their arguments."""
     given = {}
 
-    def server(url):
-        def serve(chosen, over, on_url, port):
-            given.update(chosen=chosen, over=over, port=port)
-            on_url(url)
+    def serve(chosen, over, on_url, port, *, foxglove):
+        given.update(chosen=chosen, over=over, port=port)
+        on_url("ws://127.0.0.1:5" if foxglove else "http://127.0.0.1:5/#x")
 
-        return serve
-
-    monkeypatch.setattr(module, "serve_runs", server("http://127.0.0.1:5/#x"))
-    monkeypatch.setattr(module, "serve_foxglove", server("ws://127.0.0.1:5"))
+    monkeypatch.setattr(module, "serve_runs", serve)
     return given
 
 
