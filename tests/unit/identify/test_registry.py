@@ -48,7 +48,7 @@ def test_no_two_kinds_have_one_title():
     assert len({each.title for each in CATALOGUE.values()}) == len(CATALOGUE)
 
 
-FOLDER = Path(__file__).resolve().parents[5] / "shared" / "data" / "yan9a_DBO"
+FOLDER = Path(__file__).resolve().parents[4] / "shared" / "data" / "yan9a_DBO"
 RATE_HZ = 200.0
 TABLE = TableSettings(command_column=1, displacement_column=5, rate_hz=RATE_HZ, ignore=500)
 """The model file settles after 500 rows, the test file after 600."""
