@@ -13,6 +13,7 @@ PUBLIC = (
     "response.bode",
     "response.feedback_design",
     "response.frequency_response",
+    "response.segment_spectrum",
     "response.step_response",
     "run_page",
     "steady_state",

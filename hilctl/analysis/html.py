@@ -16,7 +16,7 @@ from matplotlib.figure import Figure
 from hilctl.analysis.figure_layout import UNDATED_SVG, FigureSpec, drawn
 from hilctl.analysis.plot_style import STYLE
 from hilctl.base.files import write_text
-from hilctl.base.formatting import printable
+from hilctl.base.formatting import MISSING, printable
 
 _METADATA = re.compile(r"<metadata>.*?</metadata>", re.DOTALL)
 _GROUP = re.compile(r'<g id="[^"]*"')
@@ -103,7 +103,12 @@ def rows(heading: str, cells: Sequence[tuple[str, str]]) -> str:
     body = "\n".join(
         f"<tr><th>{text(name)}</th><td>{text(value)}</td></tr>" for name, value in cells
     )
-    return f"<section><h2>{text(heading)}</h2><table>{body}</table></section>"
+    return section(heading, f"<table>{body}</table>")
+
+
+def section(heading: str, body: str) -> str:
+    """Return a section; its body is HTML."""
+    return f"<section><h2>{text(heading)}</h2>{body}</section>"
 
 
 def grid(headings: Iterable[str], cells: Iterable[Iterable[str]]) -> str:
@@ -135,6 +140,29 @@ def figures(sheets: Iterable[FigureSpec]) -> str:
         for sheet in sheets
     )
     return f'<div class="figures">{blocks}</div>' if blocks else ""
+
+
+def results(
+    sheets: Iterable[FigureSpec],
+    heading: str,
+    tables: Sequence[tuple[str, Iterable[tuple[str, str]]]],
+    sections: Sequence[str] = (),
+) -> list[str]:
+    """Return figures, named tables of names and values, and further sections, in two columns.
+
+    Several tables become one of the full width.
+    """
+    if len(tables) == 1:
+        sections = [rows(heading, list(tables[0][1])), *sections]
+    beside = [figures(sheets)]
+    if sections:
+        beside = ['<div class="side">', *beside, *sections, "</div>"]
+    if len(tables) == 1:
+        return beside
+    known = [dict(table) for _, table in tables]
+    keys = dict.fromkeys(key for table in known for key in table)
+    cells = [(key, *(table.get(key, MISSING) for table in known)) for key in keys]
+    return [*beside, section(heading, grid(("quantity", *(name for name, _ in tables)), cells))]
 
 
 def svg(figure: Figure, alternative: str) -> str:
@@ -197,6 +225,22 @@ DEFINITIONS = {
         "Output between the excited frequencies of a multisine, rms per line, in percent of the "
         "excited lines: above the noise it is nonlinear distortion, at even and odd multiples of "
         "the lowest common frequency."
+    ),
+    "noise density": (
+        "Amplitude per root of bandwidth, from averaged spectra (Welch, Hann window): its median, "
+        "so without lines, over all frequencies or the octave at one."
+    ),
+    "Allan deviation": (
+        "Root of half the mean square difference of neighbouring means, by their averaging time: "
+        "white noise falls with the root of the time, drift rises."
+    ),
+    "bias instability": (
+        "Lowest Allan deviation over 0.664: best repeatability of a mean. An upper bound if the "
+        "deviation still falls at the longest time."
+    ),
+    "THD": (
+        "Total harmonic distortion: root of the sum of squares of the harmonics 2 to 20, over the "
+        "fundamental."
     ),
     "harmonics of the error": (
         "Amplitudes of the error's steady part at multiples of the waveform's frequency."

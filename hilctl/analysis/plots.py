@@ -43,7 +43,8 @@ from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64
 from hilctl.recording.recording import Recording
-from hilctl.signals.cycle_metrics import MAX_BINS, fold, peak_hysteresis_percent, widest_gap
+from hilctl.signals.cycle_metrics import MAX_BINS, peak_hysteresis_percent, widest_gap
+from hilctl.signals.spectrum import amplitude_spectrum, coefficients, in_bands
 
 MOST_HARMONICS = 20
 _MOST_SAMPLES = 2**20
@@ -80,13 +81,13 @@ def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um:
     if found is None:
         return None
     index, error_um, even = found
-    span = even.size
-    window = np.hanning(span + 1)[:-1]
-    wave = np.fft.rfft((even - even.mean()) * window)
-    size = np.asarray(np.abs(wave), dtype=np.float64) * (2.0 / float(window.sum()))
-    frequency_hz: F64 = np.arange(float(size.size)) * (recording.sample_rate_hz / span)
-    harmonics_um = _harmonics(index - segment.start, error_um, segment.period)
-    return ErrorSpectrum(frequency_hz[1:], size[1:], harmonics_um)
+    frequency_hz, amplitude_um = amplitude_spectrum(even, recording.sample_rate_hz)
+    since, harmonics_um = index - segment.start, np.empty(0)
+    if 2.0 * MOST_HARMONICS < segment.period <= even.size:
+        harmonics_um = 2.0 * np.abs(
+            coefficients(since, segment.period, error_um, MOST_HARMONICS)[1:]
+        )
+    return ErrorSpectrum(frequency_hz, amplitude_um, harmonics_um)
 
 
 def _even(index: I64, values: F64) -> tuple[I64, F64, F64] | None:
@@ -99,30 +100,6 @@ def _even(index: I64, values: F64) -> tuple[I64, F64, F64] | None:
     if span - index.size > _WIDEST_GAP * span or np.abs(values).max() > _LARGEST_UM:
         return None
     return index, values, np.interp(np.arange(index[0], index[-1] + 1), index, values)
-
-
-def _harmonics(index: I64, error_um: F64, period: float) -> F64:
-    """Return the amplitudes of the harmonics of the average cycle, which has little noise."""
-    if period <= 2.0 * MOST_HARMONICS:
-        return np.empty(0)
-    cycle = fold(index, period, [error_um])
-    if not cycle.whole:
-        return np.empty(0)
-    turns = np.arange(1, MOST_HARMONICS + 1)[:, None] * cycle.phase
-    waves = np.exp(-2j * np.pi * turns)
-    steps = 0.5 * ((np.roll(cycle.phase, -1) - np.roll(cycle.phase, 1)) % 1.0)  # of uneven bins
-    found: F64 = 2.0 * np.abs(waves @ (cycle.signals[0] * steps))
-    return found
-
-
-def thinned(spectrum: ErrorSpectrum, points: int) -> tuple[F64, F64]:
-    """Return frequency and largest amplitude of at most ``points`` intervals of equal ratio."""
-    x, y = spectrum.frequency_hz, spectrum.amplitude_um
-    if x.size <= points:
-        return x, y
-    edges = np.unique(np.searchsorted(x, np.geomspace(x[0], x[-1], points)))
-    middle = x[np.minimum((edges + np.append(edges[1:], x.size)) // 2, x.size - 1)]
-    return middle, np.maximum.reduceat(y, edges)
 
 
 def time_history(recording: Recording) -> FigureSpec | None:
@@ -297,7 +274,7 @@ def spectrum(recording: Recording, focus: int = 0) -> FigureSpec | None:
 
 
 def _draw_spectrum(axes: Axes, found: ErrorSpectrum) -> None:
-    x, y = thinned(found, _SPECTRUM_POINTS)
+    x, _, y = in_bands(found.frequency_hz, found.amplitude_um, _SPECTRUM_POINTS)
     axes.loglog(x, np.maximum(1e3 * y, 1e-12), color=ERROR, linewidth=0.8)
     highest = 1e3 * float(y.max())
     if highest > 0.0:

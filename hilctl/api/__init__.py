@@ -37,7 +37,16 @@ if TYPE_CHECKING:
     from hilctl.api.connection import RunConnection, connect
     from hilctl.api.models import LoadedModel, compare, export_model, identify, load_model, refine
     from hilctl.api.recordings import RecordedRun, export, list_runs, read, summarize
-    from hilctl.api.reports import figures, frf, replay, report_page, report_runs, step, tune
+    from hilctl.api.reports import (
+        figures,
+        frf,
+        replay,
+        report_page,
+        report_runs,
+        spectrum,
+        step,
+        tune,
+    )
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
     from hilctl.api.tables import RunTable, SampleTable
 
@@ -78,6 +87,7 @@ __all__ = [
     "report_page",
     "report_runs",
     "run",
+    "spectrum",
     "step",
     "summarize",
     "tune",
@@ -107,7 +117,16 @@ if not TYPE_CHECKING:
             "load_model",
             "refine",
         },
-        "reports": {"figures", "frf", "replay", "report_page", "report_runs", "step", "tune"},
+        "reports": {
+            "figures",
+            "frf",
+            "replay",
+            "report_page",
+            "report_runs",
+            "spectrum",
+            "step",
+            "tune",
+        },
         "runs": {"WrittenExperiment", "check", "init", "load", "run"},
         "tables": {"RunTable", "SampleTable"},
     }

@@ -1,8 +1,9 @@
 """Report pages, replay and figures of recordings."""
 
 from collections.abc import Callable
+from itertools import chain
 from pathlib import Path
-from typing import Literal
+from typing import Literal, TypeVar
 
 from matplotlib.axes import Axes
 
@@ -21,6 +22,7 @@ from hilctl.analysis.response.frequency_response import (
     Signals,
     frequency_response,
 )
+from hilctl.analysis.response.segment_spectrum import SegmentSpectrum, spectra, write_spectra
 from hilctl.analysis.response.step_response import SETTLED_PERCENT, StepResponse
 from hilctl.analysis.response.step_response import step_response as measured_step
 from hilctl.analysis.run_metrics import RunReport
@@ -35,6 +37,8 @@ from hilctl.run.control.client import finish_dead_runs
 from hilctl.studies.multi_run.collect import RunSeries, collect
 from hilctl.studies.multi_run.multi_run_page import write_series
 from hilctl.studies.multi_run.plots import applying_sheets, draw_sheets, write_sheets
+
+Result = TypeVar("Result")
 
 
 def report_page(
@@ -93,19 +97,57 @@ def frf(
     """
     if html is not None:
         check_writable(Path(html), overwrite=overwrite)
+    found = _of_each(runs, lambda run: frequency_response(read(run).recording, signals))
+    if html is not None:
+        write_responses(found, Path(html))
+    return tuple(found)
+
+
+def spectrum(
+    runs: Paths,
+    html: PathLike | None = None,
+    *,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    overwrite: bool = False,
+) -> tuple[SegmentSpectrum, ...]:
+    """Return the spectrum of each segment at rest and of each sine, and write their page.
+
+    A segment is at rest if it is a hold, or if its command is constant in the time range.
+
+    Args:
+        runs: Recordings.
+        html: Page to write, if any.
+        from_s: Start of the time range to evaluate.
+        to_s: End of the time range.
+        overwrite: Replace an existing page.
+
+    Raises:
+        InputError: A file does not exist, or the page cannot be written.
+        DataError: A file is not a recording, or has neither a sine nor a part at rest.
+    """
+    if html is not None:
+        check_writable(Path(html), overwrite=overwrite)
+    each = _of_each(runs, lambda run: spectra(read(run, from_s=from_s, to_s=to_s).recording))
+    found = tuple(chain.from_iterable(each))
+    if html is not None:
+        write_spectra(found, Path(html))
+    return found
+
+
+def _of_each(runs: Paths, evaluate: Callable[[Path], Result]) -> list[Result]:
+    """Return the results of all runs; raise one error with all problems."""
     found, problems = [], []
     for run in paths_of(runs):
         try:
-            found.append(frequency_response(read(run).recording, signals))
+            found.append(evaluate(run))
         except (InputError, DataError) as error:
             problems.append(error)
     if len(problems) > 1:
         raise InputError("\n".join(map(str, problems)))
     if problems:
         raise problems[0]
-    if html is not None:
-        write_responses(found, Path(html))
-    return tuple(found)
+    return found
 
 
 def step(run: RecordedRun | PathLike, *, band_percent: float = SETTLED_PERCENT) -> StepResponse:

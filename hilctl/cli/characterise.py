@@ -1,4 +1,4 @@
-"""Commands that measure an actuator: characterise, frf, step, tune."""
+"""Commands that measure an actuator: characterise, frf, spectrum, step, tune."""
 
 import shlex
 import signal
@@ -14,6 +14,7 @@ from hilctl.analysis.response.bode import fit_rows, line_table
 from hilctl.analysis.response.feedback_design import FeedbackDesign
 from hilctl.analysis.response.feedback_design import figure_rows as loop_rows
 from hilctl.analysis.response.frequency_response import FrequencyResponse, Signals
+from hilctl.analysis.response.segment_spectrum import SegmentSpectrum, spectrum_rows
 from hilctl.analysis.response.step_response import SETTLED_PERCENT, StepResponse
 from hilctl.api._types import runs_folder
 from hilctl.base.errors import RunError
@@ -24,10 +25,12 @@ from hilctl.cli.options import (
     DryRun,
     ExperimentFile,
     Fast,
+    FromTime,
     LabelTexts,
     Overwrite,
     RecordingFile,
     Settings,
+    ToTime,
     recording_paths,
 )
 from hilctl.cli.output import print_json, print_result
@@ -203,6 +206,35 @@ def frf(
     found = api.frf(runs, html, signals=signals, overwrite=overwrite)
     values = {"responses": [each.to_mapping() for each in found]}
     print_result(values, lambda: print_rich(*map(render_response, found)), as_json=as_json)
+
+
+def spectrum(
+    runs: Annotated[
+        list[Path],
+        typer.Argument(
+            help="Recordings (MCAP) of sines or at rest.",
+            metavar="RUN",
+            autocompletion=recording_paths,
+        ),
+    ],
+    html: Annotated[
+        Path | None, typer.Option(metavar="FILE", help="HTML page with plots to write.")
+    ] = None,
+    from_s: FromTime = None,
+    to_s: ToTime = None,
+    overwrite: Overwrite = False,
+    as_json: AsJson = False,
+) -> None:
+    """Measure harmonics of a sine, and noise, drift, Allan deviation at rest."""
+    found = api.spectrum(runs, html, from_s=from_s, to_s=to_s, overwrite=overwrite)
+    values = {"spectra": [each.to_mapping() for each in found]}
+    print_result(values, lambda: print_rich(*map(render_spectrum, found)), as_json=as_json)
+
+
+def render_spectrum(found: SegmentSpectrum) -> Group:
+    """Return the results of one segment."""
+    title = printable(f"{found.path}: {found.label}")
+    return Group(title, listing("", spectrum_rows(found)))
 
 
 def step(

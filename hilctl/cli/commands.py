@@ -27,7 +27,7 @@ _MODULES = {
     "hilctl.cli.reports": ("report", "figures", "replay"),
     "hilctl.cli.models": ("identify", "refine", "compare", "export-model"),
     "hilctl.cli.calibrate": ("calibrate",),
-    "hilctl.cli.characterise": ("characterise", "frf", "step", "tune"),
+    "hilctl.cli.characterise": ("characterise", "frf", "spectrum", "step", "tune"),
     "hilctl.cli.campaigns": ("campaign", "sweep", "learn"),
     "hilctl.cli.devices": ("doctor", "devices"),
     "hilctl_drivers.emulator.emulate_command": ("emulate",),

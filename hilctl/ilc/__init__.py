@@ -1,4 +1,4 @@
 """Iterative learning control: the error of one run corrects the input of the next."""
 
-PUBLIC = ("cycle", "ilc_session")
+PUBLIC = ("ilc_session",)
 """Modules that other rooms import; the others are private."""

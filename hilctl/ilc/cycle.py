@@ -9,14 +9,14 @@ import numpy as np
 from hilctl.analysis.steady_state import SteadyPart, steady_part
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
-from hilctl.base.types import C128, F64, I64
+from hilctl.base.types import C128, F64
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
+from hilctl.signals.spectrum import coefficients
 
 MAX_HARMONICS = 2000
 """Most harmonics; a bin of the average cycle is then a quarter of the shortest one."""
 
-_BINS = 8192
 _FEWEST_CYCLES = 2
 _STRONGEST_WITHIN = 16  # harmonics
 
@@ -94,25 +94,6 @@ def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> Cy
 def harmonic_count(period: float, step_hz: float, highest_hz: float) -> int:
     """Return the number of harmonics of a period, in samples, up to a frequency."""
     return max(1, min(int(period / 4.0), int(highest_hz / step_hz), MAX_HARMONICS))
-
-
-def coefficients(index: I64, period: float, signal: F64, count: int) -> C128:
-    """Return Fourier coefficients of whole cycles of a signal: complex128[count + 1].
-
-    A cosine of amplitude 1 has c_k = 0.5. Phase 0 is at multiples of ``period``; values that are
-    not finite are omitted.
-    """
-    folded = cycle_metrics.fold(index, period, (signal,), _BINS)
-    phase = folded.phase
-    around = np.concatenate(([phase[-1] - 1.0], phase, [phase[0] + 1.0]))
-    weighted = folded.signals[0] * (around[2:] - around[:-2]) * 0.5
-    turns = np.exp(-2j * np.pi * phase)
-    rotated = np.ones_like(turns)
-    found = np.empty(count + 1, dtype=np.complex128)
-    for k in range(count + 1):
-        found[k] = np.dot(weighted, rotated)
-        rotated *= turns
-    return found
 
 
 def _each_cycle(part: SteadyPart, segment: Segment, count: int) -> C128:

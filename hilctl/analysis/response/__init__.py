@@ -1,1 +1,1 @@
-"""Frequency and step responses: measurement and fit, feedback design, plots and pages."""
+"""Frequency and step responses, spectra, feedback design: measurement, fit, plots and pages."""

@@ -162,20 +162,13 @@ def line_table(found: FrequencyResponse) -> tuple[tuple[str, ...], list[tuple[st
 def write_responses(responses: Sequence[FrequencyResponse], path: Path) -> None:
     """Write the page of one or several responses; an existing file is replaced."""
     names = [each.path.stem for each in responses] if len(responses) > 1 else []
-    tables = [dict(fit_rows(each)) for each in responses]
-    keys = dict.fromkeys(key for table in tables for key in table)
+    tables = zip(names or ["value"], map(fit_rows, responses), strict=True)
+    lines = [html.section(each.path.stem, html.grid(*line_table(each))) for each in responses]
     body = [
         "<h1>Frequency response</h1>",
         html.paragraph(", ".join(str(each.path) for each in responses), "file"),
-        html.figures([response_sheet(responses, names)]),
-        "<h2>Fit</h2>",
-        html.grid(
-            ("quantity", *(names or ["value"])),
-            [(key, *(table.get(key, MISSING) for table in tables)) for key in keys],
-        ),
+        *html.results([response_sheet(responses, names)], "Fit", list(tables), lines),
     ]
-    for found in responses:
-        body += [f"<h2>{html.text(found.path.stem)}</h2>", html.grid(*line_table(found))]
     terms = html.definitions_of("coherence", "lines not excited")
     body.append(html.definitions("Definitions", terms))
     html.write_page(html.document("Frequency response", body), path)

@@ -25,9 +25,9 @@ from hilctl.base.formatting import shown_briefly
 from hilctl.base.segments import Segment
 from hilctl.base.types import C128, F64, I64
 from hilctl.identify.data.data_files import without_gaps
-from hilctl.ilc.cycle import coefficients
 from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.recording.recording import Recording
+from hilctl.signals.spectrum import each_cycle
 
 Signals: TypeAlias = Literal[
     "command-displacement", "reference-displacement", "input-displacement", "command-measured"
@@ -425,22 +425,6 @@ def _sines(recording: Recording, segments: list[Segment], columns: _Columns) -> 
         max(0.5 * float(np.ptp(sent)) for _, _, sent, _ in found),
         min(cycles for _, cycles, *_ in found),
     )
-
-
-def each_cycle(since: I64, period: float, values: F64, cycles: int) -> C128:
-    """Return coefficients 0 to 2 of each whole cycle without drift: complex128[cycles, 3].
-
-    ``since`` is the sample number since the start of the segment.
-    """
-    good = np.isfinite(values)
-    since, values = since[good], values[good]
-    number = np.floor((since - since[-1] - 0.5) / period).astype(np.int64) + cycles
-    rows = [row for k in range(cycles) if (row := number == k).any()]
-    if len(rows) > 1:  # a line through the samples would remove part of the sine
-        means = [float(values[row].mean()) for row in rows]
-        slope = np.polynomial.polynomial.polyfit(np.arange(len(rows)), means, 1)[1]
-        values = values - slope * since / period
-    return np.array([coefficients(since[r], period, values[r], 2) for r in rows])
 
 
 def _response(x: F64, frequency_hz: F64) -> C128:

@@ -10,13 +10,13 @@ import numpy as np
 from hilctl.analysis.response.frequency_response import (
     FrequencyResponse,
     NoisyResponseError,
-    each_cycle,
     frequency_response,
 )
+from hilctl.analysis.response.segment_spectrum import RestNoise, spectra
 from hilctl.analysis.steady_state import steady_samples
 from hilctl.base.errors import DataError, RunError
-from hilctl.ilc.cycle import coefficients
 from hilctl.recording.recording import Recording
+from hilctl.signals.spectrum import coefficients, each_cycle
 
 ProblemCode: TypeAlias = Literal[
     "no_reading",
@@ -46,40 +46,13 @@ _MEAN_S = 0.1
 _LONG = 10  # times that: shortest hold for creep
 
 
-@dataclass(frozen=True, slots=True)
-class RestNoise:
-    """Sensor signal at rest."""
-
-    mean_um: float
-    noise_um: float  # rms about the linear trend
-    span_um: float  # range of the readings
-    drift_um_per_s: float  # slope of the linear trend
-    line_hz: float  # frequency of the strongest spectral line
-    line_um: float  # its amplitude
-
-
-def rest_noise(recording: Recording) -> RestNoise:
-    """Evaluate a recording at constant command; at least 90 % of its readings are numbers."""
-    segment = recording.segments[0]
-    displacement_um = recording.samples.part(segment.start, segment.stop).displacement_um
-    good = np.isfinite(displacement_um)
-    if np.count_nonzero(good) < 0.9 * max(good.size, 1):
-        text = f"{np.count_nonzero(~good)} of {good.size} readings at rest are not numbers"
-        raise RigProblemError("no_reading", text, "check the sensor, its range and its wiring")
-    time_s = np.arange(good.size)[good] / recording.sample_rate_hz
-    values = displacement_um[good]
-    slope, mean = np.polynomial.polynomial.polyfit(time_s - time_s.mean(), values, 1)[::-1]
-    left = values - mean - slope * (time_s - time_s.mean())
-    lines = np.abs(np.fft.rfft(left * np.hanning(left.size))) * 4.0 / left.size
-    strongest = int(np.argmax(lines[1:])) + 1
-    return RestNoise(
-        mean_um=float(mean),
-        noise_um=float(np.std(left)),
-        span_um=float(np.ptp(values)),
-        drift_um_per_s=float(slope),
-        line_hz=strongest * recording.sample_rate_hz / left.size,
-        line_um=float(lines[strongest]),
-    )
+def noise_at_rest(recording: Recording) -> RestNoise | None:
+    """Evaluate a recording at constant command; raise RigProblemError without enough readings."""
+    try:
+        return spectra(recording)[0].rest
+    except DataError as error:
+        remedy = "check the sensor, its range and its wiring"
+        raise RigProblemError("no_reading", str(error), remedy) from None
 
 
 def crept_percent(recording: Recording) -> tuple[float, ...]:

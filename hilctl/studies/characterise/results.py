@@ -8,6 +8,7 @@ from typing import Any
 import numpy as np
 
 from hilctl.analysis.response.frequency_response import FrequencyResponse
+from hilctl.analysis.response.segment_spectrum import RestNoise
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
 from hilctl.identify.data.data_files import without_gaps
@@ -28,7 +29,7 @@ from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
 from hilctl.studies.characterise.loops import LoopFigures, Repeatability, ReversalCurves
-from hilctl.studies.characterise.response import RestNoise, StepResponseCheck
+from hilctl.studies.characterise.response import StepResponseCheck
 
 
 @dataclass(frozen=True, slots=True)

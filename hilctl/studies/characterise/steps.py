@@ -21,7 +21,7 @@ from hilctl.studies.characterise.loops import (
 from hilctl.studies.characterise.response import (
     RigProblemError,
     crept_percent,
-    rest_noise,
+    noise_at_rest,
     sine_reaction,
     small_signal,
 )
@@ -76,7 +76,8 @@ def _unevaluated(text: str) -> Evaluate:
 
 
 def _take_rest(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    found = rest_noise(recording)
+    found = noise_at_rest(recording)
+    assert found is not None
     text = f"noise {found.noise_um:.3g} µm rms, drift {found.drift_um_per_s:+.2g} µm/s"
     return replace(measured, rest=found), text
 

@@ -9,13 +9,7 @@ from matplotlib.collections import FillBetweenPolyCollection
 from hilctl.analysis import plot_style, plots
 from hilctl.analysis.figure_layout import drawn
 from hilctl.analysis.html import svg
-from hilctl.analysis.plots import (
-    ErrorSpectrum,
-    before_and_after,
-    error_spectrum,
-    hysteresis_loop,
-    thinned,
-)
+from hilctl.analysis.plots import before_and_after, error_spectrum, hysteresis_loop
 from hilctl.base.segments import Segment
 from hilctl.recording.recording import Recording, Ticks
 
@@ -248,16 +242,6 @@ def test_single_samples_may_be_missing_but_not_many(recording):
     assert error_spectrum(recording, SEGMENT, half, waves(half)) is None
     for senseless in (np.nan, 1e308):
         assert error_spectrum(recording, SEGMENT, index, np.full(index.size, senseless)) is None
-
-
-def test_a_thinned_spectrum_keeps_every_peak():
-    frequency_hz = np.arange(1.0, 20_001.0)
-    amplitude_um = np.full(20_000, 1e-3)
-    amplitude_um[[50, 15_000]] = 1.0
-    spectrum = ErrorSpectrum(frequency_hz, amplitude_um, np.empty(0))
-    x, y = thinned(spectrum, 300)
-    assert x.size == y.size <= 300
-    assert np.count_nonzero(y == 1.0) == 2
 
 
 SHORT_PERIOD = 500

@@ -9,31 +9,17 @@ from hilctl.models.linear_stages import CreepModel
 from hilctl.studies.characterise.response import (
     RigProblemError,
     crept_percent,
-    rest_noise,
+    noise_at_rest,
     sine_reaction,
     small_signal,
 )
 from hilctl.studies.characterise.waveforms import at_rest, rests, sine, small_multisine
 
 
-def test_noise_drift_and_hum_are_told_apart(limits, played):
-    """50 Hz of 0.2 um, 0.05 um of noise, 0.3 um/s of drift."""
-    t = np.arange(10_000) / 5000.0
-
-    def actuator(command):
-        return 7.0 + 0.3 * t + 0.2 * np.sin(2.0 * np.pi * 50.0 * t) + 0.0 * command
-
-    found = rest_noise(played(limits, at_rest(limits), actuator, noise_um=0.05))
-    assert found.drift_um_per_s == pytest.approx(0.3, abs=0.01)
-    assert found.mean_um == pytest.approx(7.3, abs=0.01)
-    assert found.noise_um == pytest.approx(np.hypot(0.05, 0.2 / np.sqrt(2.0)), rel=0.02)
-    assert found.line_hz == pytest.approx(50.0)
-    assert found.line_um == pytest.approx(0.2, rel=0.05)
-
-
 def test_a_sensor_without_numbers_is_a_problem(limits, played):
-    with pytest.raises(RigProblemError, match="10000 of 10000 readings") as caught:
-        rest_noise(played(limits, at_rest(limits), lambda v: v + np.nan))
+    assert noise_at_rest(played(limits, at_rest(limits), lambda v: 0.0 * v)).noise_um == 0.0
+    with pytest.raises(RigProblemError, match="10000 of 10000") as caught:
+        noise_at_rest(played(limits, at_rest(limits), lambda v: v + np.nan))
     assert caught.value.code == "no_reading"
 
 

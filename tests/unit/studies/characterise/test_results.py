@@ -8,6 +8,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilctl.analysis.response.segment_spectrum import rest_noise
 from hilctl.base.segments import Segment
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.fit_api import FitRequest
@@ -18,7 +19,6 @@ from hilctl.models.linear_stages import FirstMode
 from hilctl.models.plays import PpiModel
 from hilctl.studies.characterise import results
 from hilctl.studies.characterise.loops import LoopFigures, ReversalCurves
-from hilctl.studies.characterise.response import RestNoise
 from hilctl.studies.characterise.results import (
     FITTED,
     VALIDATED,
@@ -37,7 +37,7 @@ FOUND = Characterisation(
     experiment="rig", device="a device", unit="A", band_hz=(1.0, 400.0),
     steps=(StepRow("rest", "noise", 2.0, 0.1),),
     measured=Measured(
-        rest=RestNoise(0.0, 0.03, 0.2, 0.0, 50.0, 0.01),
+        rest=replace(rest_noise(np.arange(16.0), 5000.0), noise_um=0.03),
         growing=(LOOP,),
         reversal=ReversalCurves((0.5,), (np.zeros((2, 4)),), 0.01, 0.1),
     ),
