@@ -13,7 +13,7 @@ from hilctl.analysis.run_metrics import RunReport, SegmentReport
 from hilctl.analysis.steady_state import judged, loop_signals, trusted
 from hilctl.analysis.tick_lateness import Quantiles
 from hilctl.base.errors import DataError
-from hilctl.base.events import ADAPTED, CHANGES, LOST_READINGS, MARK, Event
+from hilctl.base.events import ADAPTED, CHANGES, LOST_READINGS, MARK, ZERO, Event
 from hilctl.base.samples import LAST_SAMPLE, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.base.strict import first_problem
@@ -93,7 +93,7 @@ def _windows(recording: Recording, events: Sequence[Event], end: int) -> Windows
     return [(each, judged(each, events, end)) for each in recording.segments]
 
 
-_KEPT = {*CHANGES, ADAPTED, LOST_READINGS, MARK}
+_KEPT = {*CHANGES, ADAPTED, LOST_READINGS, MARK, ZERO}
 """Codes of events that a report uses or lists."""
 
 
@@ -153,6 +153,7 @@ class RunReportBuilder:
         segments = tuple(segment.report() for segment in self._segments)
         adapted = [event.values for event in self._events if event.code == ADAPTED]
         lost = [event.values["readings"] for event in self._events if event.code == LOST_READINGS]
+        zeros = [event.values["offset_um"] for event in self._events if event.code == ZERO]
         return RunReport(
             **_identity(self._last),
             **self._counted(),
@@ -160,6 +161,7 @@ class RunReportBuilder:
             **self._timing(),
             adapted=dict(adapted[-1]) if adapted else {},
             lost_readings=round(sum(lost)),
+            zero_um=zeros[-1] if zeros else None,
             marks=tuple(
                 (event.sample / self._last.sample_rate_hz, event.text)
                 for event in self._events

@@ -94,6 +94,7 @@ class RunReport(RunMetrics):
         sensor_invalid_samples: Samples of the waveform with an invalid displacement.
         reading_age_max_s: Largest age of a reading; None unless the sensor sends unasked.
         lost_readings: Readings of such a sensor that did not arrive.
+        zero_um: Zero of the sensor, subtracted from its readings; None without one.
         late_ticks: Late ticks; None if not recorded.
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of the lateness of ticks;
             empty without ticks.
@@ -132,6 +133,7 @@ class RunReport(RunMetrics):
     sensor_invalid_samples: int
     reading_age_max_s: float | None
     lost_readings: int
+    zero_um: float | None
     late_ticks: int | None
     lateness_us: dict[str, float]
     lateness_by_minute: list[dict[str, float]]
@@ -174,6 +176,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("displacement", _range(report.displacement_min_um, report.displacement_max_um, "um")),
         ("limited samples", f"{report.limited_samples:,}"),
         ("invalid readings", f"{report.sensor_invalid_samples:,}"),
+        *([("sensor zero", _zero(report))] if report.zero_um is not None else []),
         *([("reading age", _age(report))] if report.reading_age_max_s is not None else []),
         ("ticks", f"{_count(report.late_ticks)} late, {_count(report.skipped_ticks)} skipped"),
         *([("timing", report.deadline_misses)] if report.deadline_misses else []),
@@ -183,6 +186,10 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("exchange", _percentiles(report.exchange_us)),
         *((f"{name} process", usage_text(each)) for name, each in report.processes.items()),
     ]
+
+
+def _zero(report: RunReport) -> str:
+    return f"{quantity(report.zero_um, 'um', 4)} subtracted from the readings"
 
 
 def _age(report: RunReport) -> str:

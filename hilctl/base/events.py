@@ -31,6 +31,12 @@ OFFSET = "offset"
 Values: ``offset_um``, and the displacements at rest, ``resting_um`` and ``model_um``.
 """
 
+ZERO = "zero"
+"""Event code of a sensor's zero, at the first sample it is subtracted from.
+
+Values: as :data:`OFFSET`. From there on a reading is ``displacement_um + offset_um``.
+"""
+
 ADAPTED = "adapted"
 """Event code of adapted parameters, once per second if they have changed, and at the end.
 

@@ -22,7 +22,7 @@ _SLEW_SHARE = 0.5  # of the slew limit, by default
 
 
 def measures_offset(config: Experiment) -> bool:
-    """Return whether a run measures its resting offset before the waveform."""
+    """Return whether a run measures its resting offset to correct the compensator's input."""
     return config.compensator is not None and config.compensator.offset == "measured"
 
 
@@ -32,7 +32,7 @@ def conditioning_of(
     """Return the conditioning before the waveform, or None."""
     # stands_um: the model displacement at its end, or None if no offset is measured.
     config, condition = loaded.config, loaded.config.condition
-    if condition is None and not measures_offset(config):
+    if condition is None and not config.zero and not measures_offset(config):
         return None
     rate_hz, block, safe = config.sample_rate_hz, config.block, config.safe.value
     cycle = np.empty(0) if condition is None else _cycle(config)
@@ -48,13 +48,17 @@ def conditioning_of(
         cycle_samples=cycle.size,
         stands_um=stands_um,
         largest_um=OFFSET_SHARE * (high_um - low_um),
+        zero=config.zero,
         lead_in=config.lead_in_samples,
     )
 
 
 def condition_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
-    """Yield the broken rules of the ``condition`` section."""
+    """Yield the broken rules of the ``condition`` section and of ``zero``."""
     config, condition = loaded.config, loaded.config.condition
+    if config.zero and measures_offset(config):
+        rule = "must be false with compensator.offset: measured, which corrects the same offset"
+        yield loaded.problem("zero", rule, "true")
     if condition is None:
         return
     unit = config.limits.unit

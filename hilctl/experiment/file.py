@@ -422,6 +422,9 @@ class Experiment(StrictModel):
         waveform: The reference.
         compensator: ``none``, or the model to invert.
         condition: Cycle before the waveform that erases the history of the actuator. Default: none.
+        zero: Whether the mean reading at rest before the waveform is subtracted from the readings
+            after it, less the model's displacement if there is a model. At most a quarter of
+            ``limits.stroke_um``.
         feedback: Controller around the compensator. Default: none.
         adaptation: Adaptation of the compensator's model during the run. Default: none.
         limits: Limits of the run.
@@ -446,6 +449,7 @@ class Experiment(StrictModel):
         ),
     ]
     condition: Condition | None = None
+    zero: bool = False
     feedback: FeedbackConfig | None = None
     adaptation: AdaptationConfig | None = None
     limits: Limits

@@ -180,7 +180,9 @@ def _start(
         soft = reference.segments[0].steady_start
         values = before.lead_in(values, max(config.lead_in_samples, soft))
     begun = begin(loaded.model, config.sample_rate_hz, values, before, begins)
-    return begun if measures_offset(config) else replace(begun, stands_um=None)
+    if config.zero and loaded.model is None:
+        return replace(begun, stands_um=0.0)
+    return begun if config.zero or measures_offset(config) else replace(begun, stands_um=None)
 
 
 def _state_before(

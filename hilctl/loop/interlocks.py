@@ -5,7 +5,7 @@ interlock's flag marks the samples.
 """
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
@@ -166,6 +166,12 @@ class Interlocks:
         memory = self._memory
         memory[kernels.COMMAND] = command
         memory[kernels.HEAT] = max(memory[kernels.HEAT], command**2)
+
+    def zero(self, offset_um: float) -> None:
+        """Shift the sensor's range, because an offset is subtracted from its readings."""
+        low, high = self.context.sensor_um
+        self.context = replace(self.context, sensor_um=(low - offset_um, high - offset_um))
+        self._numbers[[kernels.RAIL_LOW, kernels.RAIL_HIGH]] = self.context.sensor_um
 
     def judge(self, block: Block) -> Trip | None:
         """Check the next block; return its first trip, or None."""

@@ -3,7 +3,8 @@
 The commands of the conditioning cycle are computed before the run, and pass the limiter. After the
 cycle the output rests at the safe value. The mean displacement at rest is compared with the
 model's, and the offset is subtracted from the compensator's input: a sensor or actuator that has
-moved since identification causes no error.
+moved since identification causes no error. For a sensor without a defined zero it is subtracted
+from the readings instead, and the actuator does not move.
 """
 
 import math
@@ -23,9 +24,11 @@ class Conditioning:
         command: float64[m], requested commands, whole blocks; the last ones rest at the safe value.
         rest: Start and stop of the samples at rest; those after it cover the device's latency.
         cycle_samples: Samples of the cycle; 0 if there is only rest.
-        stands_um: The model's displacement at rest; None if no offset is measured.
+        stands_um: The model's displacement at rest, 0 without a model; None if no offset is
+            measured.
         largest_um: Largest offset that is removed.
         lead_in: Samples of the waveform over which the correction fades in.
+        zero: Whether the offset is subtracted from the readings.
     """
 
     command: F64
@@ -34,13 +37,14 @@ class Conditioning:
     stands_um: float | None = None
     largest_um: float = math.inf
     lead_in: int = 1
+    zero: bool = False
 
 
 class LeadIn:
     """Samples of a run before its waveform: a ramp of whole blocks, then the conditioning.
 
     At rest it measures the offset between sensor and model, which is then subtracted from the
-    compensator's input.
+    compensator's input or from the readings.
     """
 
     def __init__(self, conditioning: Conditioning | None, ramp_samples: int) -> None:
@@ -51,6 +55,8 @@ class LeadIn:
         self._sum_um, self._count = 0.0, 0
         self._about_um, self._square_um2 = math.nan, 0.0
         self._offset_um = 0.0
+        self.zero_um: float | None = None
+        """Offset that is subtracted from the readings; None without one."""
         if conditioning is not None:
             self.waveform_at += conditioning.command.size
             first, stop = conditioning.rest
@@ -81,7 +87,10 @@ class LeadIn:
         wanted[:] = self._conditioning.command[start : start + wanted.size]
 
     def take(self, first_sample: int, displacement_um: F64) -> None:
-        """Add the displacements of a block, float64[B]; only samples at rest count."""
+        """Add the displacements of a block at rest, float64[B]; zero those of a later block."""
+        if self.zero_um is not None:
+            displacement_um -= self.zero_um
+            return
         low, high = self._rest[0] - first_sample, self._rest[1] - first_sample
         if low < displacement_um.size and high > 0:
             resting = displacement_um[max(low, 0) : high]
@@ -109,12 +118,17 @@ class LeadIn:
         offset_um = measured_um - stands_um
         values = {"offset_um": offset_um, "resting_um": measured_um, "model_um": stands_um}
         rests = f"at rest the sensor shows {measured_um:.4g} µm, the model {stands_um:.4g} µm"
+        zero = conditioning.zero
         if not abs(offset_um) <= conditioning.largest_um:
             limit = f"an offset beyond {conditioning.largest_um:.4g} µm"
-            return f"{rests}: {limit}: identify the model anew", values, True
-        self._offset_um = offset_um
-        text = f"{rests}: {offset_um:.4g} µm are subtracted from the compensator's input"
-        return text, values, False
+            cure = "adjust the sensor" if zero else "identify the model anew"
+            return f"{rests}: {limit}: {cure}", values, True
+        target = "readings" if zero else "compensator's input"
+        if zero:
+            self.zero_um = offset_um
+        else:
+            self._offset_um = offset_um
+        return f"{rests}: {offset_um:.4g} µm are subtracted from the {target}", values, False
 
     @property
     def resting_um(self) -> float:

@@ -18,11 +18,11 @@ import numpy as np
 
 from hilctl.base.device import AgingDevice, Device, WatchdogDevice
 from hilctl.base.errors import DeviceError
-from hilctl.base.events import LOST_READINGS, OFFSET, Event
+from hilctl.base.events import LOST_READINGS, OFFSET, ZERO, Event
 from hilctl.base.samples import ANSWERS, BlockHeader, Flag
 from hilctl.base.types import F64, U32
 from hilctl.loop.block import Block
-from hilctl.loop.interlocks import Interlocks, Trip
+from hilctl.loop.interlocks import Interlocks
 from hilctl.loop.lead_in import LeadIn
 from hilctl.loop.limiter import Limiter
 from hilctl.loop.pacer import Lateness, Pacer
@@ -339,12 +339,15 @@ class Loop:
                 getattr(answered, column)[:] = getattr(self._device, column)
         if not early:
             in_flight.popleft()
-            self._process_answer(answered, self._interlocks.judge(answered))
+            self._process_answer(answered)
 
-    def _process_answer(self, block: Block, trip: Trip | None) -> None:
-        """Pass an answered block to feedback and adaptation, record it, and act on a trip."""
+    def _process_answer(self, block: Block) -> None:
+        """Check an answered block, pass it to feedback and adaptation, record it, act on a trip."""
         if self._learns:
+            # Before the interlocks, because it may zero the displacement.
             self._before.take(block.head[_FIRST_SAMPLE], block.displacement_um)
+        trip = self._interlocks.judge(block)
+        if self._learns:
             # Before it is recorded: then its slot may be reused.
             if self._plan.feedback is not None:
                 self._plan.feedback.take(block)
@@ -416,6 +419,11 @@ class Loop:
         text, values, refused = self._before.remove_offset()
         if refused:
             self._begin_safe_ramp("fault", OFFSET, text)
+        elif self._before.zero_um is not None:
+            self._interlocks.zero(self._before.zero_um)
+            # Of the next answer, which may still belong to the rest.
+            first = self._in_flight[0].head[_FIRST_SAMPLE] if self._in_flight else self._next_sample
+            self._host.record_event(Event(first, "info", ZERO, text, values))
         elif text:
             self._host.record_event(Event(self._next_sample, "info", OFFSET, text, values))
 

@@ -13,7 +13,7 @@ from hilctl.analysis.response.step_response import StepResponse, step_response
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.steady_state import steady_part
 from hilctl.base.errors import ConfigError, DataError, InputError, ModelError
-from hilctl.base.events import OFFSET
+from hilctl.base.events import OFFSET, ZERO
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
@@ -82,7 +82,9 @@ def _figures(
     worst: Segment | None,
     structure: FrequencyResponse | StepResponse | None,
 ) -> RunFigures:
-    measured = [event.values.get("offset_um") for event in recording.events if event.code == OFFSET]
+    measured = [
+        event.values.get("offset_um") for event in recording.events if event.code in (OFFSET, ZERO)
+    ]
     return RunFigures(
         peak_hysteresis_percent=report.peak_hysteresis_percent,
         peak_error_percent=report.peak_error_percent,

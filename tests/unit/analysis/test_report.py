@@ -12,7 +12,7 @@ import pytest
 from hilctl.analysis.report import SegmentReportBuilder, processes_of, summarize, worst_segment
 from hilctl.analysis.run_metrics import RunReport, run_rows
 from hilctl.base.errors import DataError
-from hilctl.base.events import ADAPTED, LOST_READINGS, MARK, TUNED, Event
+from hilctl.base.events import ADAPTED, LOST_READINGS, MARK, TUNED, ZERO, Event
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
@@ -139,6 +139,13 @@ class TestSteadyPeriodicRun:
         report = summarize(replace(recording, samples=samples, events=(event,)))
         assert (report.reading_age_max_s, report.lost_readings) == (0.02, 7)
         assert "reading age" in dict(run_rows(report))
+
+    def test_zero_of_the_sensor(self, lagging) -> None:
+        assert summarize(lagging()).zero_um is None
+        event = Event(0, "info", ZERO, "", {"offset_um": 1.25})
+        report = summarize(replace(lagging(), events=(event,)))
+        assert report.zero_um == 1.25
+        assert dict(run_rows(report))["sensor zero"].startswith("1.250 µm")
 
     def test_period_too_short_tells_no_noise(self, lagging) -> None:
         """With 12 samples a period, signal can't be told from noise."""

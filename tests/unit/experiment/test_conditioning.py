@@ -139,6 +139,16 @@ class TestCheck:
         assert (measured.conditioning().command == 0.0).all()
         assert conditioning_of(loaded(text=PIEZO)).stands_um is None
 
+    def test_zero_of_the_sensor_is_measured_with_and_without_a_model(self):
+        rest = check(loaded("condition=null", "zero=true")).conditioning()
+        assert (rest.zero, rest.cycle_samples) == (True, 0)
+        assert rest.stands_um is not None
+        bare = ("compensator=none", "waveform.unit=A", "waveform.amplitude=1.0")
+        plain = check(loaded("condition=null", "zero=true", *bare)).conditioning()
+        assert (plain.zero, plain.stands_um, plain.largest_um) == (True, 0.0, 0.25 * 135.0)
+        with pytest.raises(ConfigError, match="zero: must be false"):
+            check(loaded("zero=true", "compensator.offset=measured"))
+
     def test_forecast_counts_it(self):
         checked, plain = check(loaded()), check(loaded("condition=null"))
         assert plain.forecast.before_s == 0.0

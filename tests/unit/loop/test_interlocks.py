@@ -125,6 +125,13 @@ class TestSensorRange:
         assert trips(limits, 1, displacement=rail)[0].code == "sensor_range"
         assert trips(limits, 1, displacement=np.nextafter(rail, 0.0))[0] is None
 
+    def test_a_zero_shifts_the_range_and_not_the_stroke(self):
+        bench = Fed(STROKE)
+        bench.interlocks.zero(60.0)
+        assert bench.feed(1, displacement=39.0) is None
+        trip = bench.feed(1, displacement=40.0)
+        assert (trip.code, "-160 to 40" in trip.reason) == ("sensor_range", True)
+
 
 FROZEN = replace(STROKE, frozen_s=0.01, frozen_travel=0.5)
 

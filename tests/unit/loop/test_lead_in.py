@@ -5,7 +5,7 @@ import math
 import numpy as np
 import pytest
 
-from hilctl.base.events import OFFSET
+from hilctl.base.events import OFFSET, ZERO
 from hilctl.base.samples import Flag
 from hilctl.loop.lead_in import Conditioning, LeadIn
 from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice
@@ -198,3 +198,40 @@ class TestOffset:
             resting.take(first, shown[first : first + size])
         assert resting.resting_um == pytest.approx(shown[160:180].mean(), rel=1e-12)
         assert resting.noise_um == pytest.approx(shown[160:180].std(), rel=1e-6)
+
+
+class BiasedFifo(FakeFifoDevice):
+    """Shows 3 um more than ten times the command, some blocks later."""
+
+    def exchange(self, first_sample, command, displacement_um, measured):
+        super().exchange(first_sample, command, displacement_um, measured)
+        displacement_um += 3.0
+
+
+class TestZero:
+    @pytest.mark.parametrize("latency", [0, 3])
+    def test_readings_after_the_rest_are_less_by_its_mean(self, latency):
+        device = BiasedFifo(latency) if latency else Biased()
+        given = conditioning(latency, stands_um=1.0, zero=True)
+        rig = Rig(sine(200), block=10, device=device, conditioning=given)
+        assert rig.run().code == "completed"
+        (event,) = (each for each in rig.host.events if each.code == ZERO)
+        assert event.sample == rig.waveform_at - 10 * latency
+        assert dict(event.values) == {"offset_um": 2.0, "resting_um": 3.0, "model_um": 1.0}
+        moved = rig.host.column(3)
+        reading = moved + np.where(np.arange(moved.size) < event.sample, 0.0, 2.0)
+        expected = 3.0 + 10.0 * np.array([0.0, *rig.device.commands])[: reading.size]
+        np.testing.assert_allclose(reading, expected, atol=1e-9)
+        assert rig.host.column(5)[rig.waveform_at :][:200].tolist() == sine(200).tolist()
+
+    def test_interlocks_use_the_zeroed_displacement(self):
+        given = conditioning(block=1, stands_um=0.0, zero=True)
+        options = {"device": Biased(), "stroke_um": (-31.0, 31.0), "conditioning": given}
+        assert Rig(sine(50), **options).run().code == "completed"
+        rig = Rig(sine(50), **options | {"conditioning": conditioning(block=1)})
+        assert "stroke limits" in rig.run().reason
+
+    def test_a_zero_beyond_the_limit_ends_the_run(self):
+        given = conditioning(block=1, stands_um=0.0, zero=True, largest_um=2.0)
+        outcome = Rig(sine(50), device=Biased(), conditioning=given).run()
+        assert (outcome.code, "beyond 2 µm" in outcome.reason) == ("fault", True)
