@@ -16,7 +16,7 @@ from scipy.optimize import least_squares
 from hilctl.base.errors import ModelError
 from hilctl.base.types import C128, F64
 from hilctl.identify.data.records import History, Record
-from hilctl.models.linear_stages import FurtherMode
+from hilctl.models.linear_stages import MODE_NUMBERS, FurtherMode, modes_of
 
 SEGMENT_S = 0.3  # long compared with the decay of a mode, short compared with a record
 FASTEST_HZ = 20e3  # sample rate of the analysis; modes are below a quarter of it
@@ -33,7 +33,6 @@ DISTINCT = 1.15  # minimum frequency ratio of two further modes
 LEAST_DAMPING, MOST_DAMPING = 2e-3, 0.3
 NEAR = math.log(2.0)  # maximum of antiresonance over resonance
 SMOOTH = 3  # parameters of the smooth part: gain, slope, bend
-PAIR = 4
 MOST = 3
 
 
@@ -222,14 +221,14 @@ def _bounds(spectra: _Spectra, x: F64, first_hz: float | None) -> tuple[F64, F64
     low, high = np.full(x.size, -9.0), np.full(x.size, 9.0)
     bottom, top = math.log(spectra.frequency_hz[0]), math.log(spectra.frequency_hz[-1])
     dampings = math.log(LEAST_DAMPING), math.log(MOST_DAMPING)
-    for k in range(0, x.size - SMOOTH, PAIR):
+    for k in range(0, x.size - SMOOTH, MODE_NUMBERS):
         ends = bottom, top
         if first_hz is not None:
             first = math.log(first_hz)
             below = x[k] < first
             ends = (bottom, first - math.log(APART)) if below else (first + math.log(APART), top)
-        low[k : k + PAIR] = ends[0], dampings[0], -NEAR, dampings[0]
-        high[k : k + PAIR] = ends[1], dampings[1], NEAR, dampings[1]
+        low[k : k + MODE_NUMBERS] = ends[0], dampings[0], -NEAR, dampings[0]
+        high[k : k + MODE_NUMBERS] = ends[1], dampings[1], NEAR, dampings[1]
     return low, high
 
 
@@ -245,16 +244,7 @@ def _packed(modes: Sequence[FurtherMode]) -> F64:
 
 def _modes(x: F64) -> tuple[FurtherMode, ...]:
     """Undo :func:`_packed`."""
-    numbers = np.exp(x[:-SMOOTH]).reshape(-1, PAIR).tolist()
-    return tuple(
-        FurtherMode(
-            natural_hz=natural_hz,
-            damping_ratio=damping_ratio,
-            antiresonance_hz=ratio * natural_hz,
-            antiresonance_damping_ratio=antiresonance_damping_ratio,
-        )
-        for natural_hz, damping_ratio, ratio, antiresonance_damping_ratio in numbers
-    )
+    return modes_of(x[:-SMOOTH])
 
 
 def _response(x: F64, frequency_hz: F64) -> C128:

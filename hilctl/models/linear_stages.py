@@ -202,6 +202,12 @@ class FirstMode(StrictModel):
         return motion
 
 
+def second_order(frequency_hz: F64, natural_hz: float, damping_ratio: float) -> C128:
+    """Return 1 + 2 zeta s / w + s^2 / w^2 at frequencies: complex128[n]."""
+    part = 1j * frequency_hz / natural_hz
+    return np.asarray(1.0 + 2.0 * damping_ratio * part + part**2)
+
+
 class FurtherMode(StrictModel):
     """A further mode of the structure, with its antiresonance.
 
@@ -244,9 +250,8 @@ class FurtherMode(StrictModel):
 
     def response(self, frequency_hz: F64) -> C128:
         """Return the frequency response: complex128[n]."""
-        up, down = 1j * frequency_hz / self.antiresonance_hz, 1j * frequency_hz / self.natural_hz
-        zeros = 1.0 + 2.0 * self.antiresonance_damping_ratio * up + up**2
-        return np.asarray(zeros / (1.0 + 2.0 * self.damping_ratio * down + down**2))
+        zeros = second_order(frequency_hz, self.antiresonance_hz, self.antiresonance_damping_ratio)
+        return np.asarray(zeros / second_order(frequency_hz, self.natural_hz, self.damping_ratio))
 
     def _parameters(self, sample_rate_hz: float) -> F64:
         """Return float64[12], see :func:`~hilctl.kernels.dynamics.mode_block`."""
@@ -257,6 +262,28 @@ class FurtherMode(StrictModel):
         position, velocity, direct = 1.0 - ratio**2, 2.0 * damping, ratio**2
         at_once = position * motion[0, 3] + velocity * motion[1, 3] + direct
         return np.array([*motion.ravel(), position, velocity, direct, at_once])
+
+
+MODE_NUMBERS = 4
+
+
+def modes_of(logarithms: F64) -> tuple[FurtherMode, ...]:
+    """Return modes from the parameters of a fit: float64[4 m].
+
+    They are the logarithms of each mode's natural frequency, damping ratio, ratio of the
+    antiresonance to it, and damping ratio of the antiresonance.
+    """
+    return tuple(
+        FurtherMode(
+            natural_hz=natural_hz,
+            damping_ratio=damping_ratio,
+            antiresonance_hz=ratio * natural_hz,
+            antiresonance_damping_ratio=antiresonance_damping_ratio,
+        )
+        for natural_hz, damping_ratio, ratio, antiresonance_damping_ratio in np.exp(logarithms)
+        .reshape(-1, MODE_NUMBERS)
+        .tolist()
+    )
 
 
 def _decay(parameters: F64) -> float:

@@ -121,28 +121,6 @@ def test_the_fit_is_a_transfer_function_of_scipy(measured):
     assert len(plain["magnitude"]) == plain["excited_lines"] == EXCITED.size
 
 
-def test_a_further_mode_is_found_with_its_antiresonance(make_recording):
-    """Two modes share the displacement; the second has a quarter of it."""
-    other = 2.0 * np.pi * 1100.0
-    modes = [(0.75, OMEGA, DAMPING), (0.25, other, 0.02)]
-    factors = [np.array([w**-2, 2.0 * z / w, 1.0]) for _, w, z in modes]
-    zeros = 0.75 * factors[1] + 0.25 * factors[0]
-    sampled = signal.cont2discrete((zeros, np.polymul(*factors)), 1.0 / RATE_HZ, method="zoh")
-    command, segments = excitation("multisine")
-    moved = signal.lfilter(sampled[0][0], sampled[1], np.tile(command, 2))[N:]
-    found = frequency_response(
-        make_recording(moved, command=command, segments=segments, sample_rate_hz=RATE_HZ)
-    )
-    (mode,) = found.further
-    assert found.natural_hz == pytest.approx(NATURAL_HZ, rel=0.01)
-    assert mode.natural_hz == pytest.approx(1100.0, rel=0.01)
-    assert mode.damping_ratio == pytest.approx(0.02, rel=0.05)
-    true_hz = np.sqrt(1.0 / zeros[0]) / (2.0 * np.pi)
-    assert mode.antiresonance_hz == pytest.approx(true_hz, rel=0.01)
-    _, answer = signal.freqresp(found.to_scipy(), 2.0 * np.pi * found.frequency_hz)
-    np.testing.assert_allclose(np.abs(answer), np.abs(found.fitted), rtol=0.02)
-
-
 def test_a_displacement_that_falls_has_a_negative_gain(measured):
     found = measured(*excitation("multisine"), distorted=lambda u: -u)
     assert found.gain_um == pytest.approx(-GAIN_UM, rel=0.01)
