@@ -229,7 +229,7 @@ def spectrum_rows(found: SegmentSpectrum) -> Iterator[tuple[str, str]]:
         yield "noise", f"{quantity(rest.noise_um, 'um')} rms"
         yield "largest deviation", quantity(rest.peak_um, "um")
         yield "mean", quantity(rest.mean_um, "um", 4)
-        yield "drift", quantity(rest.drift_um_per_s, "um/s")
+        yield "drift", quantity(_NM * rest.drift_um_per_s, "nm/s")
         yield (
             "strongest line",
             f"{quantity(rest.line_um, 'um')} at {quantity(rest.line_hz, 'Hz', 4)}",
