@@ -20,7 +20,7 @@ from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import DeviceError
 from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.loop.block import Block
-from hilctl.loop.interlocks import InterlockContext, Interlocks, InterlockSettings
+from hilctl.loop.interlocks import AuxLimit, InterlockContext, Interlocks, InterlockSettings
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
@@ -102,6 +102,7 @@ class FakeInfo:
     simulated: bool = False
     confirms: bool = True
     arm_s: float = 0.0
+    aux: tuple = ()
 
 
 DESCRIBED = DeviceInfo(
@@ -253,8 +254,8 @@ class FakeHost:
         return np.concatenate([columns[row] for columns in self.columns])
 
 
-def made_block(block=1, state_size=1, fill=np.nan):
-    area = BlockBatch.empty(1, block, state_size)
+def made_block(block=1, state_size=1, fill=np.nan, aux=0):
+    area = BlockBatch.empty(1, block, state_size, aux)
     area.columns[:] = fill
     return Block(area.heads[0].data.cast("B").cast("q"), area, 0)
 
@@ -269,6 +270,7 @@ class RigInterlocks:
     safe: float = 0.0
     frozen_travel: float = math.inf
     heat_a2: float = 0.0
+    aux: tuple[AuxLimit, ...] = ()
     sensor_invalid_s: float | None = None
     frozen_s: float | None = None
     frozen_um: float | None = None

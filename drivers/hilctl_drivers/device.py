@@ -56,6 +56,8 @@ class DacDevice(ABC):
                 low_um, high_um = curve[1][[0, -1]].tolist()
                 info = replace(info, sensor_min_um=low_um, sensor_max_um=high_um)
                 self._curve = curve
+        self.aux: F64 = np.full(len(info.aux), np.nan)
+        """Newest values of the auxiliary channels."""
         self._info = info
         self._title = title
         self._action = action

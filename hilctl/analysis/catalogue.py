@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.formatting import printable
 from hilctl.base.segments import Segment
-from hilctl.recording.metadata_keys import END_FIGURES, LABELS_FACT
+from hilctl.recording.metadata_keys import AUX_FACT, END_FIGURES, LABELS_FACT
 from hilctl.recording.run_summary import read_ends
 from hilctl.recording.validation import labels_of, segments_of
 
@@ -60,7 +60,7 @@ those of facts in a recording.
 
 _BOOLEANS = {"true": True, "false": False, "True": True, "False": False}
 _MOST_DIGITS = 15
-_OPTION_PREFIXES = ("device.", "waveform.")
+_OPTION_PREFIXES = ("device.", "waveform.", f"{AUX_FACT}.")
 _PREFIXES = ("label.", *_OPTION_PREFIXES)
 _SQL_TYPES = {str: "TEXT", int: "INTEGER", bool: "INTEGER", float: "REAL", dict: "TEXT"}
 _CREATE = "CREATE TABLE recordings ({})".format(
@@ -68,7 +68,7 @@ _CREATE = "CREATE TABLE recordings ({})".format(
 )
 _TOKEN = re.compile(
     r"""'[^']*' | "(?P<text>[^"]*)" | \[(?P<bracketed>[^]]*)\]
-    | \b(?P<dotted>(?:label|device|waveform)(?:\.\w+)+)""",
+    | \b(?P<dotted>(?:label|device|waveform|aux)(?:\.\w+)+)""",
     re.VERBOSE,
 )
 _CHAIN = re.compile(r"'[^']*'|(?P<chain>[<>]=?\s*[^\s<>=()']+\s*[<>])")
@@ -228,7 +228,7 @@ def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
     entry[LABELS_FACT] = labels
     entry["options"] = {
         key: _plain(text)
-        for key, text in ends.run.items()
+        for key, text in {**ends.run, **ends.end}.items()
         if key.startswith(_OPTION_PREFIXES) and text != "None"
     }
     return entry

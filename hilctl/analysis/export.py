@@ -43,9 +43,9 @@ def export(
     """Write samples atomically to a file in the format of its suffix.
 
     Columns are ``sample``, ``t_s`` (since the start of the run), those of
-    :class:`hilctl.base.samples.Samples` under their recorded names, and ``flags``. ``measured_a``
-    or ``measured_v`` exists if the device measures it. NPZ, Parquet and MATLAB files also have the
-    facts of the run, and the experiment and model as YAML.
+    :class:`hilctl.base.samples.Samples` under their recorded names, auxiliary channels and
+    ``flags``. ``measured_a`` or ``measured_v`` exists if the device measures it. NPZ, Parquet and
+    MATLAB files also have the facts of the run, and the experiment and model as YAML.
 
     Args:
         recording: The run, or its pieces in order for bounded memory
@@ -115,12 +115,14 @@ def columns(recording: Recording) -> Columns:
     samples = recording.samples
     named = {each.name: values for each, values in _recorded(recording)}
     times_s = samples.index / recording.sample_rate_hz
-    return {"sample": samples.index, "t_s": times_s, **named, "flags": samples.flags}
+    given = {"sample": samples.index, "t_s": times_s, **named, **recording.aux}
+    return {**given, "flags": samples.flags}
 
 
 def units(recording: Recording) -> dict[str, str]:
     """Return the unit of each column of :func:`columns` that has one."""
-    return {"t_s": "s", **{each.name: each.unit for each, _ in _recorded(recording)}}
+    aux = {each.name: each.unit for each in recording.aux_channels}
+    return {"t_s": "s", **{each.name: each.unit for each, _ in _recorded(recording)}, **aux}
 
 
 def _recorded(recording: Recording) -> Iterator[tuple[RecordedField, F64]]:

@@ -11,6 +11,7 @@ from typing import Any, ClassVar, Protocol, runtime_checkable
 
 from hilctl.base.calibration import NamedCalibration
 from hilctl.base.errors import InputError
+from hilctl.base.samples import RECORDED_FIELDS
 from hilctl.base.strict import Field, StrictModel
 from hilctl.base.types import F64, CommandUnit
 
@@ -49,6 +50,29 @@ class VoltageLimit(DeviceOptions):
         moved = -math.expm1(-self.resistance_ohm / self.inductance_h * period_s)
         before = current_a[:-1]
         return self.resistance_ohm * (before + (current_a[1:] - before) / moved)
+
+
+_TAKEN = {"sample", "t_s", "flags", *(each.name for each in RECORDED_FIELDS)}
+
+
+@dataclass(frozen=True, slots=True)
+class AuxChannel:
+    """An auxiliary channel: another input of the device, such as a temperature.
+
+    Attributes:
+        name: Key under ``limits.aux`` and column of the recording; with its unit, ``coil_c``.
+        unit: Unit as text; may be empty.
+        meaning: One line of text; may be empty.
+    """
+
+    name: str
+    unit: str = ""
+    meaning: str = ""
+
+    def __post_init__(self) -> None:
+        if not self.name.isidentifier() or self.name in _TAKEN:
+            rule = "must be a word of letters, digits and '_', and no column of a recording"
+            raise InputError(f"aux.{self.name}: the name {rule}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +116,8 @@ class DeviceInfo:
         files: YAML texts for the recording by file name, such as ``profile.yaml``.
         calibration: Calibration of sensor and amplifier. With one of the sensor, the device has the
             last exchange's readings before their correction as ``reading_um``.
+        aux: Auxiliary channels. With any, the device has their newest values after an exchange as
+            ``aux``, float64[len(aux)]; NaN is a missing value.
     """
 
     name: str
@@ -120,6 +146,7 @@ class DeviceInfo:
     details: Mapping[str, str] = field(default_factory=dict)
     files: Mapping[str, str] = field(default_factory=dict)
     calibration: NamedCalibration | None = None
+    aux: tuple[AuxChannel, ...] = ()
 
     @property
     def corrects_readings(self) -> bool:

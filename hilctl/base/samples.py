@@ -155,6 +155,8 @@ class Samples:
             answered=True,
         ),
     ] = field(default_factory=_empty)
+    aux: F64 = field(default_factory=lambda: np.empty((0, 0)))
+    """Auxiliary channels, float64[n, k], the same for all samples of a block; empty without any."""
     flags: U32
 
     @classmethod
@@ -177,6 +179,7 @@ class Samples:
             name: values[chosen] if values.size else values
             for name, values in self.columns().items()
         }
+        columns["aux"] = self.aux[chosen] if self.aux.size else self.aux
         return replace(self, index=self.index[chosen], flags=self.flags[chosen], **columns)
 
     def part(self, start: int, stop: int) -> Self:
@@ -230,21 +233,24 @@ class BlockBatch:
             before it.
         columns: float64[k, len(COLUMNS), B], see :data:`COLUMNS`.
         flags: uint32[k, B].
+        aux: float64[k, a], the value of each auxiliary channel of the device.
     """
 
     heads: I64
     states: F64
     columns: F64
     flags: U32
+    aux: F64
 
     @classmethod
-    def empty(cls, blocks: int, block: int, state_size: int) -> "BlockBatch":
+    def empty(cls, blocks: int, block: int, state_size: int, aux: int = 0) -> "BlockBatch":
         """Return room for blocks, in this process's own memory."""
         return cls(
             np.zeros((blocks, len(BlockHeader)), dtype=np.int64),
             np.zeros((blocks, state_size)),
             np.full((blocks, len(COLUMNS), block), np.nan),
             np.zeros((blocks, block), dtype=np.uint32),
+            np.full((blocks, aux), np.nan),
         )
 
     def rows(self, chosen: slice | I64) -> "BlockBatch":
@@ -254,12 +260,22 @@ class BlockBatch:
             self.states[chosen].copy(),
             self.columns[chosen].copy(),
             self.flags[chosen].copy(),
+            self.aux[chosen].copy(),
         )
 
     def samples(self, blocks: slice = _ALL) -> Samples:
         """Return the samples of some blocks, one after the other."""
         values = self.columns[blocks].transpose(1, 0, 2).reshape(len(COLUMNS), -1)
-        return Samples.of(self.index(blocks), values, self.flags[blocks].ravel())
+        samples = Samples.of(self.index(blocks), values, self.flags[blocks].ravel())
+        if not self.aux.size:
+            return samples
+        return replace(samples, aux=self.aux[blocks].repeat(self.flags.shape[1], axis=0))
+
+    def clear_answers(self, blocks: slice | I64) -> None:
+        """Set all that the device fills to NaN."""
+        for row in ANSWERS:
+            self.columns[blocks, row] = np.nan
+        self.aux[blocks] = np.nan
 
     def index(self, blocks: slice = _ALL) -> I64:
         """Return the sample indices of some blocks, one after the other."""

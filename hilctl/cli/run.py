@@ -27,6 +27,7 @@ from hilctl.base.formatting import printable, unit_text
 from hilctl.cli.console import compile_progress, console, listing, progress_bar, table
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import print_json, print_result
+from hilctl.experiment.device_rules import interlock_context
 from hilctl.experiment.file import label_settings
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.live.server_process import served_beside
@@ -299,6 +300,8 @@ def print_forecast(checked: CheckedExperiment) -> None:
         rows["tracking error"] = (
             f"{most}, longer than {interlocks.tracking_s or 0.0:g} s ends the run"
         )
+    if aux := interlock_context(config, info).aux:
+        rows["auxiliary"] = "; ".join(f"{each.channel.name}: {each}" for each in aux)
     if info.safe_note:
         rows["safe value"] = info.safe_note
     if forecast.heating_rms_a is not None:

@@ -8,7 +8,12 @@ from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigProblem, DeviceError
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.loop.interlocks import InterlockContext, InterlockRequirement, InterlockSettings
+from hilctl.loop.interlocks import (
+    AuxLimit,
+    InterlockContext,
+    InterlockRequirement,
+    InterlockSettings,
+)
 
 SHORTEST_TICK_S = 1e-4
 """Shortest tick that timers keep on most machines: an idle CPU takes up to 0.1 ms to wake."""
@@ -135,19 +140,29 @@ def _watchdog_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
 def interlock_context(config: Experiment, info: DeviceInfo) -> InterlockContext:
     """Return the facts about the rig that the interlocks of a run need."""
     low, high = config.limits.command_range
+    limits = config.limits.aux or {}
+    spans = [limits.get(each.name, math.inf) for each in info.aux]
     return InterlockContext(
         stroke_um=config.limits.stroke_um,
         sensor_um=(info.sensor_min_um, info.sensor_max_um),
         unit=config.limits.unit,
         safe=config.safe.value,
         frozen_travel=_TRAVEL * (high - low),
+        aux=tuple(
+            AuxLimit(channel, *(span if isinstance(span, tuple) else (-math.inf, span)))
+            for channel, span in zip(info.aux, spans, strict=True)
+        ),
     )
 
 
 def _interlock_problems(loaded: LoadedExperiment) -> list[ConfigProblem]:
     """Return the interlocks whose requirements are not met."""
-    limits = loaded.config.limits
+    limits, info = loaded.config.limits, loaded.device.info
+    names = [each.name for each in info.aux]
+    known = f"must be an auxiliary channel of {info.name} ({', '.join(names) or 'it has none'})"
     return [
+        loaded.problem(f"limits.aux.{key}", known) for key in limits.aux or {} if key not in names
+    ] + [
         loaded.problem(f"limits.{key}", rule)
         for key, field in InterlockSettings.model_fields.items()
         if getattr(limits, key) is not None

@@ -241,6 +241,8 @@ class Limits(InterlockSettings):
         slew_v_per_s: Fastest change of the drive voltage, V/s.
         stroke_um: Lowest and highest measured displacement, um; outside, the run ends with its safe
             ramp.
+        aux: Highest value of an auxiliary channel of the device, or its lowest and highest value,
+            by name and in its unit. A missing value counts as outside after ``sensor_invalid_s``.
     """
 
     peak_current_a: Annotated[float, Field(gt=0.0)] | None = None
@@ -249,6 +251,7 @@ class Limits(InterlockSettings):
     drive_v: Interval | None = None
     slew_v_per_s: Annotated[float, Field(gt=0.0)] | None = None
     stroke_um: Interval
+    aux: dict[str, float | Interval] | None = None
 
     @model_validator(mode="after")
     def _one_unit(self) -> Self:

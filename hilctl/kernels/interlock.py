@@ -23,6 +23,8 @@ class InterlockFlag(IntFlag):
     """The thermal budget of the coil was used up."""
     TRACKING_ERROR = 512
     """The displacement was too far from the reference for too long."""
+    AUX = 1024
+    """An auxiliary channel was outside its limits, or missing for too long; checked per block."""
 
 
 (

@@ -29,6 +29,7 @@ class Block:
         input_um: The compensator's input: float64[B]; in the waveform's unit without a model.
         reading_age_s: Age of the displacement, if the sensor sends unasked: float64[B].
         reading_um: Displacement before its correction, if there is a calibration: float64[B].
+        aux: Auxiliary channels of the device: float64[a].
     """
 
     def __init__(self, head: "memoryview[int]", area: BlockBatch, slot: int) -> None:
@@ -37,7 +38,7 @@ class Block:
         self.number = self.skipped = 0
         self.state, self.flags = area.states[slot], area.flags[slot]
         self.memory = self.state[:-1]
-        self.columns = area.columns[slot]
+        self.columns, self.aux = area.columns[slot], area.aux[slot]
         # In the order of COLUMNS.
         (
             self.reference,

@@ -10,6 +10,7 @@ from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 
+from hilctl.base.device import AuxChannel
 from hilctl.base.errors import InputError
 from hilctl.base.samples import BlockHeader, Flag
 from hilctl.base.strict import Field, StrictModel
@@ -20,11 +21,12 @@ from hilctl.kernels.jit import compiled
 from hilctl.loop.block import Block
 
 TripCode: TypeAlias = Literal[
-    "stroke", "sensor_range", "sensor_frozen", "deviation", "thermal", "tracking_error"
+    "stroke", "sensor_range", "sensor_frozen", "deviation", "thermal", "tracking_error", "aux"
 ]
 
 _FIRST_SAMPLE = int(BlockHeader.FIRST_SAMPLE)
 _TRIPPED = sum(InterlockFlag)
+_AUX = int(InterlockFlag.AUX)
 
 
 @dataclass(frozen=True, slots=True)
@@ -118,6 +120,27 @@ class InterlockSettings(StrictModel):
 
 
 @dataclass(frozen=True, slots=True)
+class AuxLimit:
+    """Lowest and highest permitted value of an auxiliary channel; infinite without a limit."""
+
+    channel: AuxChannel
+    low: float = -math.inf
+    high: float = math.inf
+
+    @property
+    def is_limited(self) -> bool:
+        """Whether there is a limit."""
+        return math.isfinite(self.low) or math.isfinite(self.high)
+
+    def __str__(self) -> str:
+        unit = f" {self.channel.unit}".rstrip()
+        if not self.is_limited:
+            return f"no limit{unit and ','}{unit}"
+        least = f"{self.low:g} to" if math.isfinite(self.low) else "at most"
+        return f"{least} {self.high:g}{unit}"
+
+
+@dataclass(frozen=True, slots=True)
 class InterlockContext:
     """Properties of the rig that interlocks need.
 
@@ -128,6 +151,7 @@ class InterlockContext:
         frozen_travel: Travel of the command after which a reading must change, in ``unit``.
         heat_a2: Heat of the coil before the run: running mean square of the current in A^2, at
             least that of the safe value.
+        aux: The auxiliary channels of the device with their limits.
     """
 
     stroke_um: tuple[float, float]
@@ -136,6 +160,7 @@ class InterlockContext:
     safe: float = 0.0
     frozen_travel: float = math.inf
     heat_a2: float = 0.0
+    aux: tuple[AuxLimit, ...] = ()
 
     def __post_init__(self) -> None:
         if not self.frozen_travel > 0.0:
@@ -159,6 +184,8 @@ class Interlocks:
         self._memory[kernels.COMMAND] = context.safe
         self._memory[kernels.HEAT] = max(context.heat_a2, context.safe**2)
         self._next_sample = 0
+        self._aux = [(k, each) for k, each in enumerate(context.aux) if each.is_limited]
+        self._aux_missing = [0] * len(context.aux)  # samples
         self._interlock_block = compiled(kernels.interlock_block)
 
     def begin_at(self, command: float) -> None:
@@ -177,7 +204,8 @@ class Interlocks:
         """Check the next block; return its first trip, or None."""
         sent = block.command, block.reference
         came = block.displacement_um, block.measured
-        return self.check(block.head[_FIRST_SAMPLE], *sent, *came, block.flags)
+        trip = self.check(block.head[_FIRST_SAMPLE], *sent, *came, block.flags)
+        return self._check_aux(block) if trip is None and self._aux else trip
 
     def check(
         self,
@@ -216,6 +244,29 @@ class Interlocks:
         sent = (before, command.item(k), measured.item(k))
         seen = (reference.item(k), displacement_um.item(k))
         return self._trip(first_sample + k, flags.item(k), sent, seen)
+
+    def _check_aux(self, block: Block) -> Trip | None:
+        """Check the auxiliary channels; a missing value may last as long as an invalid reading."""
+        for k, limit in self._aux:
+            value = block.aux.item(k)
+            if limit.low <= value <= limit.high:
+                self._aux_missing[k] = 0
+                continue
+            if math.isnan(value):
+                self._aux_missing[k] += block.skipped + block.flags.size
+                if self._aux_missing[k] <= self._numbers[kernels.MISSING_SAMPLES]:
+                    continue
+            block.flags |= _AUX
+            return self._aux_trip(block.head[_FIRST_SAMPLE], limit, value)
+        return None
+
+    def _aux_trip(self, sample: int, limit: AuxLimit, value: float) -> Trip:
+        name = limit.channel.name
+        text = f"{name} {value:.4g} {limit.channel.unit} at sample {sample} must be {limit}"
+        if math.isnan(value):
+            since = _since(self.settings.sensor_invalid_s)
+            text = f"{name} at sample {sample} is no valid reading{since}"
+        return Trip(sample, "aux", text)
 
     def _hold(self, samples: int) -> None:
         """Account for skipped samples: the output and all conditions stay."""

@@ -73,8 +73,12 @@ class Loop:
         self._device = device
         self._aging = cast(AgingDevice, device) if device.info.ages_readings else None
         info = device.info
-        has = {"reading_age_s": info.ages_readings, "reading_um": info.corrects_readings}
-        self._attributes = [column for column, there in has.items() if there]
+        has = {
+            "reading_age_s": info.ages_readings,
+            "reading_um": info.corrects_readings,
+            "aux": bool(info.aux),
+        }
+        self._attributes = [name for name, there in has.items() if there]
         self._host = host
         self._clock = host.clock
         self._compensator = plan.compensator
@@ -335,8 +339,8 @@ class Loop:
         )
         head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
         if self._attributes:
-            for column in self._attributes:
-                getattr(answered, column)[:] = getattr(self._device, column)
+            for name in self._attributes:
+                getattr(answered, name)[:] = getattr(self._device, name)
         if not early:
             in_flight.popleft()
             self._process_answer(answered)
@@ -478,7 +482,7 @@ class Loop:
             text += f"; {describe(output.state, output.error)}"
         for block in self._in_flight:
             if block.due:
-                block.columns[ANSWERS] = np.nan
+                block.columns[ANSWERS] = block.aux[:] = np.nan
                 block.flags |= (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
                 self._record(block)
         self._record_adapted(ended=True)

@@ -35,6 +35,7 @@ class BlockArrays:
         columns: float64[n] by name of their field; empty ones are omitted.
         state: float64[s], the compensator's memory before it; mostly empty.
         previous_command: float64[1] or empty: the command before it.
+        aux: float64[exchanges * channels], the auxiliary channels of each exchange; empty without.
     """
 
     tick0: int
@@ -44,6 +45,7 @@ class BlockArrays:
     columns: Mapping[str, F64]
     state: F64
     previous_command: F64
+    aux: F64
 
 
 def encode_block(block: BlockArrays, t_rel: F64) -> bytes:
@@ -52,6 +54,7 @@ def encode_block(block: BlockArrays, t_rel: F64) -> bytes:
         "t_rel": t_rel,
         "state": block.state,
         "previous_command": block.previous_command,
+        "aux": block.aux,
         **block.columns,
     }
     twin = _BLOCK_TWIN(
@@ -82,6 +85,7 @@ def decode_block(data: bytes) -> BlockArrays:
         columns=columns,
         state=np.frombuffer(twin.state),
         previous_command=np.frombuffer(twin.previous_command),
+        aux=np.frombuffer(twin.aux),
     )
 
 

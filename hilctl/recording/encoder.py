@@ -178,7 +178,7 @@ class MessageMaker:
                 stop += 1
             part = slice(row * block, stop * block)
             cut = {field.name: values[part] for field, values in columns}
-            yield self._block(batch, row, flags[part], cut, t_rel[part])
+            yield self._block(batch, slice(row, stop), flags[part], cut, t_rel[part])
             first = part.start + -int(index[part.start]) % self._stride
             on_grid.append(np.arange(first, part.stop, self._stride))
             row = stop
@@ -191,8 +191,9 @@ class MessageMaker:
         yield self._ticks(batch)
 
     def _block(
-        self, batch: BlockBatch, row: int, flags: U32, columns: dict[str, F64], t_rel: F64
+        self, batch: BlockBatch, rows: slice, flags: U32, columns: dict[str, F64], t_rel: F64
     ) -> Encoded:
+        row = rows.start
         first = int(batch.heads[row, BlockHeader.FIRST_SAMPLE])
         dropped = int(batch.heads[row, BlockHeader.DROPPED_BEFORE])
         begins = self.samples == 0 or bool(dropped)
@@ -205,6 +206,7 @@ class MessageMaker:
             columns=columns,
             state=state[:-1],
             previous_command=state[-1:],
+            aux=batch.aux[rows],
         )
         self.samples += flags.size
         self.missing += dropped

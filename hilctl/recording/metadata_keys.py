@@ -19,6 +19,9 @@ END_FIGURES = (
     "rms_error_percent",
 )
 """Facts of the end of a run: the worst value of its segments, as in a report."""
+AUX_FACT = "aux"
+"""Fact of a run: its auxiliary channels, a JSON list of objects with name, unit and meaning. Facts
+of its end begin with it: ``aux.NAME.min`` and ``aux.NAME.max``, the range of each channel."""
 USAGE_FACT = "processes"
 """Fact of the end of a run: resource usage of ``loop`` and ``supervisor``, as JSON objects."""
 OVERRIDES_FACT = "overrides"

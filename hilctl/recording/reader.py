@@ -5,12 +5,15 @@ from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import closing
+from dataclasses import replace
+from functools import cached_property
 from pathlib import Path
 from typing import Any
 
 import numpy as np
 from mcap.records import Attachment, Channel, McapRecord, Message, Metadata
 
+from hilctl.base.device import AuxChannel
 from hilctl.base.errors import DataError
 from hilctl.base.events import Event
 from hilctl.base.files import no_such_file, reason
@@ -25,6 +28,7 @@ from hilctl.recording.time_range import TimeRange, places_of
 from hilctl.recording.validation import (
     RATES_HZ,
     MessageValidator,
+    aux_channels_of,
     count_of,
     labels_of,
     number_of,
@@ -125,11 +129,12 @@ class RecordingBuilder:
         return self._bounds
 
     def _block(self, block: BlockArrays) -> None:
-        self._budget.keep(_NUMBER_BYTES * block.n * len(COLUMNS))
+        self._budget.keep(_NUMBER_BYTES * block.n * (len(COLUMNS) + len(self._channels)))
         self.samples += block.n
         self.waiting += block.n
         index = np.arange(block.tick0, block.tick0 + block.n)
-        self._add({"index": index, "flags": block.flags, **block.columns})
+        columns = {**block.columns, "aux": self._aux_of(block)}
+        self._add({"index": index, "flags": block.flags, **columns})
         for previous in block.previous_command.tolist():
             self._budget.keep(_EVENT_BYTES + _NUMBER_BYTES * block.state.size)
             self._starts.append(ReplayStart(block.tick0, block.state.copy(), previous))
@@ -142,6 +147,19 @@ class RecordingBuilder:
         """Remove a column and return its values; an empty array if it is missing."""
         parts = self._columns.pop(name, [])
         return np.concatenate(parts).astype(kind, copy=False) if parts else np.empty(0, dtype=kind)
+
+    @cached_property
+    def _channels(self) -> tuple[AuxChannel, ...]:
+        return aux_channels_of(self._run)
+
+    def _aux_of(self, block: BlockArrays) -> F64:
+        """Return float64[n, a], the value of its exchange for each sample; NaN if damaged."""
+        width = len(self._channels)
+        exchanges = block.aux.size // width if width else 0
+        if not exchanges or exchanges * width != block.aux.size or block.n % exchanges:
+            return np.full((block.n, width), np.nan)
+        values: F64 = block.aux.reshape(exchanges, width)
+        return values.repeat(block.n // exchanges, axis=0)
 
     def piece(self, path: Path, *, last: bool = False) -> Recording:
         """Return everything taken since the last piece; the last one has the end of the run."""
@@ -191,11 +209,13 @@ class RecordingBuilder:
                 if name.startswith(DEVICE_FILES)
             },
             "labels": labels_of(run),
+            "aux_channels": self._channels,
         }
 
     def _blocks_of(self, unit: CommandUnit) -> Samples:
         index, flags = self._pop("index", np.int64), self._pop("flags", np.uint32)
-        samples = _samples(index, flags, unit, self._pop)
+        aux = self._pop("aux").reshape(index.size, len(self._channels))
+        samples = replace(_samples(index, flags, unit, self._pop), aux=aux)
         if samples.index.size:
             recorded = {name for name, values in samples.columns().items() if values.size}
             if recorded != (self._recorded or recorded):

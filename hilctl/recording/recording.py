@@ -4,6 +4,7 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
+from hilctl.base.device import AuxChannel
 from hilctl.base.events import Event
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
@@ -63,6 +64,7 @@ class Recording:
         starts: Possible starts of a replay.
         correction_yaml: The learned correction that was added to the reference, or empty.
         device_files: YAML texts by name: ``profile.yaml`` and ``reader_profile.yaml``.
+        aux_channels: Auxiliary channels, in the order of ``samples.aux``.
     """
 
     path: Path
@@ -82,3 +84,9 @@ class Recording:
     correction_yaml: str = ""
     labels: Mapping[str, LabelValue] = field(default_factory=dict)
     device_files: Mapping[str, str] = field(default_factory=dict)
+    aux_channels: tuple[AuxChannel, ...] = ()
+
+    @property
+    def aux(self) -> Mapping[str, F64]:
+        """Auxiliary channels by name, float64[n]; the samples of a block have one value."""
+        return {each.name: self.samples.aux[:, k] for k, each in enumerate(self.aux_channels)}

@@ -50,6 +50,8 @@ _MESSAGES: dict[str, _Fields] = {
         # command before it.
         "state": (14, _DOUBLE, True),
         "previous_command": (15, _DOUBLE, True),
+        # Auxiliary channels: the values of each exchange, one exchange after the other.
+        "aux": (19, _DOUBLE, True),
         **_columns("block"),
     },
     "TickBlock": {

@@ -16,6 +16,8 @@ from google.protobuf.message import DecodeError
 from mcap.records import Channel, McapRecord, Message, Schema
 from pydantic import Field, TypeAdapter, ValidationError
 
+from hilctl.base.device import AuxChannel
+from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import CHANGES, INVERSE
 from hilctl.base.samples import (
     COLUMNS,
@@ -30,7 +32,7 @@ from hilctl.base.strict import StrictModel, first_problem
 from hilctl.base.types import CommandUnit
 from hilctl.recording import schema
 from hilctl.recording.codec import BlockArrays, decode_block, decode_ticks
-from hilctl.recording.metadata_keys import LABELS_FACT, LabelValue
+from hilctl.recording.metadata_keys import AUX_FACT, LABELS_FACT, LabelValue
 from hilctl.recording.recording import TICK_COLUMNS, Ticks
 
 MAX_UNIX_NS = 2**63 - 1
@@ -239,6 +241,19 @@ def _is_label(value: object) -> bool:
     if isinstance(value, int | float):
         return not isinstance(value, bool) and abs(value) < math.inf
     return isinstance(value, str)
+
+
+_AUX = TypeAdapter(tuple[AuxChannel, ...])
+
+
+def aux_channels_of(facts: Mapping[str, str]) -> tuple[AuxChannel, ...]:
+    """Return the auxiliary channels of a run, if any; raise DataError if they are damaged."""
+    text = facts.get(AUX_FACT, "[]")
+    try:
+        return _AUX.validate_json(text)
+    except (ValidationError, InputError):
+        rule = f"{AUX_FACT} must be a list of channels"
+        raise DataError(f"metadata hilctl.run: {rule}, got {short(text)}") from None
 
 
 def number_of(facts: Mapping[str, str], name: str, low: float, high: float) -> float:

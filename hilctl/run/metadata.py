@@ -2,6 +2,7 @@
 
 import hashlib
 import json
+import math
 import platform
 import sys
 import uuid
@@ -14,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from hilctl import __version__
+from hilctl.base.device import AuxChannel
 from hilctl.base.errors import RunError
 from hilctl.base.events import CHANGES, Event
 from hilctl.base.samples import COLUMNS, NO_WAVEFORM, Flag, Samples
@@ -25,6 +27,7 @@ from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.diagnosis import machine_facts
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import (
+    AUX_FACT,
     END_FIGURES,
     HEAT_FACT,
     HOLDS_FACT,
@@ -82,6 +85,8 @@ def run_facts(
         "max_missed_share": repr(config.timing.max_missed_share),
         "units": json.dumps({"t_rel": "s"} | {each.name: each.unit for each in recorded}),
     }
+    if info.aux:
+        facts[AUX_FACT] = json.dumps([asdict(each) for each in info.aux], ensure_ascii=False)
     facts |= {
         f"waveform.{key}": str(value)
         for key, value in config.waveform
@@ -239,15 +244,22 @@ def setting_rows(value: Any, key: str = "") -> list[SettingRow]:
 class EndFigures:
     """Collect the metrics of a run."""
 
-    def __init__(self, segments: Sequence[Segment], *, compensated: bool) -> None:
+    def __init__(
+        self, segments: Sequence[Segment], *, compensated: bool, aux: Sequence[AuxChannel] = ()
+    ) -> None:
         self._segments = list(segments)
         self._compensated = compensated
+        self._aux = aux
+        self._aux_low, self._aux_high = np.full((2, len(aux)), np.nan)
         self._done: list[tuple[Segment, dict[str, float]]] = []
         self._changes: list[Event] = []
         self._current: SegmentMetrics | None = None
 
     def add(self, samples: Samples) -> None:
         """Add the next samples of the run."""
+        if self._aux:
+            self._aux_low = np.fmin(self._aux_low, np.fmin.reduce(samples.aux))
+            self._aux_high = np.fmax(self._aux_high, np.fmax.reduce(samples.aux))
         index = samples.index[(samples.flags & NO_WAVEFORM) == 0]
         while self._segments and index.size and self._segments[0].steady_start <= index[-1]:
             segment = self._segments[0]
@@ -271,10 +283,17 @@ class EndFigures:
             self._changes.append(event)
 
     def facts(self) -> dict[str, str]:
-        """Return the maximum of each metric over all segments, as text."""
+        """Return the maximum of each metric over all segments, and the ranges of aux, as text."""
         judged = [figures for segment, figures in self._done if not self._tuned(segment)]
         known = {name: [each[name] for each in judged if name in each] for name in END_FIGURES}
-        return {name: repr(max(values)) for name, values in known.items() if values}
+        ends = {"min": self._aux_low.tolist(), "max": self._aux_high.tolist()}
+        found = {name: repr(max(values)) for name, values in known.items() if values}
+        return found | {
+            f"{AUX_FACT}.{each.name}.{end}": repr(values[k])
+            for k, each in enumerate(self._aux)
+            for end, values in ends.items()
+            if math.isfinite(values[k])
+        }
 
     def _tuned(self, segment: Segment) -> bool:
         """Return whether a change of the reference affects the steady part of a segment."""

@@ -79,7 +79,8 @@ class Recorder:
         except OSError as error:
             raise InputError(self._cannot(reason(error))) from None
         compensated = self._checked.loaded.model is not None
-        self._figures = EndFigures(self._run.segments, compensated=compensated)
+        aux = self._checked.loaded.device.info.aux
+        self._figures = EndFigures(self._run.segments, compensated=compensated, aux=aux)
         # Before anything moves: the file may have been deleted.
         if not self.flush():
             raise InputError(self.error)

@@ -422,6 +422,7 @@ class Supervisor:
                 block=config.block,
                 state_size=self._checked.state_size,
                 latency_blocks=info.latency_blocks,
+                aux=len(info.aux),
             )
         except OSError as error:
             raise RunError(

@@ -12,7 +12,7 @@ import numpy as np
 from hilctl.base.device import Clock, Device
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import Event
-from hilctl.base.samples import ANSWERS, BlockBatch, Samples
+from hilctl.base.samples import BlockBatch, Samples
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.block import Block
 from hilctl.loop.loop import Loop
@@ -57,7 +57,8 @@ class OfflineHost:
         self.clock: Clock = VirtualClock()
         # No slot is reused before its batch was passed on.
         slots = _BLOCKS_A_BATCH + 2 * (plan.latency_blocks + 1)
-        self._room = BlockBatch.empty(slots, plan.block, plan.compensator.state_size + 1)
+        state_size, aux = plan.compensator.state_size + 1, len(plan.interlocks.aux)
+        self._room = BlockBatch.empty(slots, plan.block, state_size, aux)
         heads = [head.data.cast("B").cast("q") for head in self._room.heads]
         self._blocks = [Block(head, self._room, slot) for slot, head in enumerate(heads)]
         self._claimed = self._first = self._answered = 0
@@ -87,7 +88,7 @@ class OfflineHost:
             taken = np.arange(self._first, self._answered) % size
             self._on_batch(self._room.rows(taken))
             self._room.flags[taken] = 0
-            self._room.columns[taken[:, None], ANSWERS] = np.nan
+            self._room.clear_answers(taken)
             self._first = self._answered
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:

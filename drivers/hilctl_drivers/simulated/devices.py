@@ -5,13 +5,14 @@ outside that is a device with a sample clock and a FIFO of its own, so they are 
 buffered.
 """
 
+import math
 from abc import abstractmethod
 from dataclasses import asdict, replace
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 import numpy as np
 
-from hilctl.base.device import DeviceInfo, DeviceOptions, VoltageLimit
+from hilctl.base.device import AuxChannel, DeviceInfo, DeviceOptions, VoltageLimit
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.strict import (
     Field,
@@ -51,12 +52,18 @@ class SimulatedFault(StrictModel):
     """A fault to inject, permanent from its sample on, to test the reaction of a run."""
 
     kind: Literal[
-        "sensor_nan", "sensor_frozen", "sensor_jump", "sensor_inverted", "no_answer", "refused"
+        "sensor_nan",
+        "sensor_frozen",
+        "sensor_jump",
+        "sensor_inverted",
+        "aux_nan",
+        "no_answer",
+        "refused",
     ] = Field(
         description="sensor_nan: readings are not numbers; sensor_frozen: the last good reading"
         " is repeated; sensor_jump: readings are off by half the sensor's range; sensor_inverted:"
-        " readings have the other sign; no_answer: exchanges time out; refused: exchanges are"
-        " refused"
+        " readings have the other sign; aux_nan: auxiliary channels are not numbers; no_answer:"
+        " exchanges time out; refused: exchanges are refused"
     )
     at_sample: int = Field(ge=0, description="first sample that has the fault")
 
@@ -188,6 +195,8 @@ class SimulatedDevice(DacDevice):
         spoilt = displacement_um[start:]
         if fault.kind == "sensor_nan":
             spoilt[:] = np.nan
+        elif fault.kind == "aux_nan":
+            self.aux[:] = np.nan
         elif fault.kind == "sensor_frozen":
             spoilt[:] = good
         elif fault.kind == "sensor_inverted":
@@ -236,6 +245,39 @@ class Drift(DeviceOptions):
     tau_s: float = Field(gt=0.0, description="its time constant, s")
 
 
+class CoilTemperatures(DeviceOptions):
+    """Temperatures of coil and rods by the coil's loss; they do not act on the displacement.
+
+    The coil warms by first order to ``coil_k_per_w`` R i^2 above the room, and the rods to a share
+    of the coil's rise.
+    """
+
+    ambient_c: float = Field(default=23.0, ge=-50.0, le=100.0, description="of the room, degC")
+    resistance_ohm: float = Field(default=2.0, gt=0.0, le=1e3, description="of the coil, ohm")
+    coil_k_per_w: float = Field(
+        default=1.0, gt=0.0, le=1e3, description="final rise of the coil per watt, K/W"
+    )
+    coil_tau_s: float = Field(default=60.0, ge=1e-3, description="its time constant, s")
+    rod_share: float = Field(
+        default=0.5, ge=0.0, le=1.0, description="final rise of the rods per rise of the coil"
+    )
+    rod_tau_s: float = Field(default=300.0, ge=1e-3, description="its time constant, s")
+
+    def warm(self, aux: F64, square_a2: float, time_s: float) -> None:
+        """Advance the temperatures of coil and rods, float64[2], at a mean square of current."""
+        coil, rod = aux.tolist()
+        end = self.ambient_c + self.coil_k_per_w * self.resistance_ohm * square_a2
+        coil += (end - coil) * -math.expm1(-time_s / self.coil_tau_s)
+        end = self.ambient_c + self.rod_share * (coil - self.ambient_c)
+        aux[:] = coil, rod + (end - rod) * -math.expm1(-time_s / self.rod_tau_s)
+
+
+_TEMPERATURES = (
+    AuxChannel("coil_c", "°C", "temperature of the coil"),
+    AuxChannel("rod_c", "°C", "temperature of the rods"),
+)
+
+
 class TerfenolOptions(SimulatedOptions):
     """Options of ``simulated_terfenol``."""
 
@@ -272,6 +314,10 @@ class TerfenolOptions(SimulatedOptions):
     creep: CreepEffect | None = Field(default=None, description="creep of the displacement")
     thermal: Thermal | None = Field(
         default=None, description="growth of the displacement with the rods' temperature"
+    )
+    temperatures: CoilTemperatures | None = Field(
+        default=None,
+        description="auxiliary channels coil_c and rod_c, the temperatures of coil and rods",
     )
     second_mode: SecondMode | None = Field(
         default=None, description="a mode of the structure beside the first"
@@ -400,7 +446,24 @@ class SimulatedTerfenol(SimulatedDevice):
             command_min=command_min,
             command_max=command_max,
             command_step=self._parameters.dac_range_a / self._parameters.dac_codes,
+            aux=_TEMPERATURES if options.temperatures else (),
         )
+
+    def _open(self, sample_rate_hz: float, block: int) -> None:
+        super()._open(sample_rate_hz, block)
+        self._period_s = 1.0 / sample_rate_hz
+        if self._options.temperatures is not None:
+            self.aux[:] = self._options.temperatures.ambient_c
+
+    def _exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        before = self._next_sample
+        super()._exchange(first_sample, command, displacement_um, measured)
+        if (temperatures := self._options.temperatures) is not None:
+            current_a = measured + self._options.bias_a
+            passed_s = (self._next_sample - before) * self._period_s
+            temperatures.warm(self.aux, float(current_a @ current_a) / current_a.size, passed_s)
 
     def plant(self, sample_rate_hz: float) -> Plant:
         """Return the actuator at rest."""

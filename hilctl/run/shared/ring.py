@@ -24,7 +24,6 @@ import numpy as np
 import numpy.typing as npt
 
 from hilctl.base.samples import (
-    ANSWERS,
     COLUMNS,
     LAST_SAMPLE,
     LONGEST_NS,
@@ -49,7 +48,7 @@ _MOST_BLOCKS = 50_000
 """Most block objects that are created before the first tick; each takes 1.3 kB."""
 _BATCH_SAMPLES = 8192
 """Approximate samples per batch; their processing takes ten times their memory."""
-_TYPES = (np.int64, np.float64, np.float64, np.uint32)
+_TYPES = (np.int64, np.float64, np.float64, np.uint32, np.float64)
 
 
 class SampleRing:
@@ -83,10 +82,10 @@ class SampleRing:
         self._publish, self._observe = self.page.publishes, self.page.observes
         self.slots, self.block = self.page.get(PageField.SLOTS), self.page.get(PageField.BLOCK)
         self._spare = self.page.get(PageField.SPARE)
-        state_size = self.page.get(PageField.STATE_SIZE)
-        if min(self.slots, self.block, self._spare, state_size) < 1:
+        state_size, aux = self.page.get(PageField.STATE_SIZE), self.page.get(PageField.AUX)
+        if min(self.slots, self.block, self._spare, state_size, aux + 1) < 1:
             raise ValueError(f"{path}: is damaged")
-        self._area = self._views(state_size)
+        self._area = self._views(state_size, aux)
         self._heads = memoryview(self._area.heads.data.cast("B")).cast("q")
         self._spares_used = 0
         self._blocks: list[Block] = []
@@ -94,11 +93,18 @@ class SampleRing:
 
     @classmethod
     def create(
-        cls, path: Path, *, slots: int, block: int, state_size: int, latency_blocks: int = 0
+        cls,
+        path: Path,
+        *,
+        slots: int,
+        block: int,
+        state_size: int,
+        latency_blocks: int = 0,
+        aux: int = 0,
     ) -> Self:
         """Create a ring and allocate its memory; raise OSError if there is none."""
         spare = latency_blocks + 1  # blocks that may be under way in spare slots
-        _, size = _layout(slots + spare, block, state_size)
+        _, size = _layout(slots + spare, block, state_size, aux)
         descriptor = os.open(path, os.O_RDWR | os.O_CREAT | os.O_EXCL, 0o600)
         try:
             # Allocated now: missing memory must fail here, not during the run.
@@ -107,6 +113,7 @@ class SampleRing:
                 numbers = memoryview(memory).cast("q")
                 numbers[PageField.SLOTS], numbers[PageField.BLOCK] = slots, block
                 numbers[PageField.STATE_SIZE], numbers[PageField.SPARE] = state_size, spare
+                numbers[PageField.AUX] = aux
                 # Last: an incomplete ring is not valid.
                 numbers[PageField.MAGIC] = _MAGIC
                 numbers.release()
@@ -116,8 +123,8 @@ class SampleRing:
         made._clean(slice(None))
         return made
 
-    def _views(self, state_size: int) -> BlockBatch:
-        layout, size = _layout(self.slots + self._spare, self.block, state_size)
+    def _views(self, state_size: int, aux: int) -> BlockBatch:
+        layout, size = _layout(self.slots + self._spare, self.block, state_size, aux)
         if size > len(self._map):
             raise ValueError(f"{self.path}: is shorter than it says")
         arrays: list[Any] = [
@@ -249,7 +256,7 @@ class SampleRing:
     def _clean(self, slots: slice) -> None:
         """Reset flags and answers of slots."""
         self._area.flags[slots] = 0
-        self._area.columns[slots, ANSWERS] = np.nan
+        self._area.clear_answers(slots)
 
     def unanswered(self, next_sample: int) -> BlockBatch | None:
         """Return the blocks that a dead producer sent without an answer, or None."""
@@ -264,7 +271,7 @@ class SampleRing:
         )
         if not batch.heads.shape[0]:
             return None
-        batch.columns[:, ANSWERS] = np.nan
+        batch.clear_answers(slice(None))
         batch.flags[:] |= np.uint32((Flag.SENSOR_INVALID | Flag.UNANSWERED).value)
         ends = [next_sample, *(batch.heads[:-1, BlockHeader.FIRST_SAMPLE] + self.block).tolist()]
         batch.heads[:, BlockHeader.DROPPED_BEFORE] = batch.heads[:, BlockHeader.FIRST_SAMPLE] - ends
@@ -288,11 +295,12 @@ def _whole(heads: I64, number: int) -> npt.NDArray[np.bool_]:
 
 
 def _layout(
-    slots: int, block: int, state_size: int
+    slots: int, block: int, state_size: int, aux: int
 ) -> tuple[list[tuple[Any, tuple[int, ...], int]], int]:
-    """Return type, shape and offset of heads, states, columns and flags, and the file's size."""
-    width, found, end = len(COLUMNS), [], _PAGE_SIZE
-    shapes = (slots, len(BlockHeader)), (slots, state_size), (slots, width, block), (slots, block)
+    """Return type, shape and offset of the arrays of a BlockBatch, and the file's size."""
+    found, end = [], _PAGE_SIZE
+    rows = (len(BlockHeader),), (state_size,), (len(COLUMNS), block), (block,), (aux,)
+    shapes = [(slots, *row) for row in rows]
     for dtype, shape in zip(_TYPES, shapes, strict=True):
         found.append((dtype, shape, end))
         size = math.prod(shape) * np.dtype(dtype).itemsize

@@ -53,6 +53,7 @@ class PageField(IntEnum):
     BLOCK = 2
     STATE_SIZE = 3
     SPARE = 4
+    AUX = 5
     SENT = 7
     HEAD = 8
     TAIL = 16

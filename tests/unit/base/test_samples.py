@@ -11,7 +11,8 @@ BLOCK = 5
 
 def batch(blocks: int) -> BlockBatch:
     """Return blocks of random numbers that follow one another."""
-    made = BlockBatch.empty(blocks, BLOCK, 1)
+    made = BlockBatch.empty(blocks, BLOCK, 1, aux=2)
+    made.aux[:] = np.arange(2 * blocks).reshape(blocks, 2)
     rng = np.random.default_rng(1)
     made.heads[:, BlockHeader.FIRST_SAMPLE] = 100 + BLOCK * np.arange(blocks)
     made.columns[:] = rng.normal(size=made.columns.shape)
@@ -23,7 +24,7 @@ def same(found: Samples, expected: Samples) -> bool:
     """Return whether every array is the same."""
     return all(
         np.array_equal(getattr(found, name), getattr(expected, name))
-        for name in ("index", "flags", *COLUMNS)
+        for name in ("index", "flags", "aux", *COLUMNS)
     )
 
 
@@ -41,6 +42,7 @@ def test_rows_of_a_block_are_the_columns_in_order() -> None:
     for row, name in enumerate(COLUMNS):
         assert getattr(samples, name).tolist() == made.columns[1:, row].ravel().tolist()
     assert samples.flags.tolist() == made.flags[1:].ravel().tolist()
+    assert samples.aux.tolist() == [[2.0, 3.0]] * BLOCK + [[4.0, 5.0]] * BLOCK
     answers = ["displacement_um", "measured", "reading_age_s", "reading_um"]
     assert [list(COLUMNS)[row] for row in ANSWERS] == answers
 

@@ -103,6 +103,7 @@ class TestConsistency:
         (CURRENT, ["deviation_s=0.1"], "limits.measured_deviation_a"),
         (VOLTAGE, ["deviation_s=0.1"], "limits.measured_deviation_v"),
         (CURRENT, ["measured_deviation_v=1.0"], "in V"),
+        (CURRENT, ["aux.coil_c=80"], "has none"),
         (VOLTAGE, ["rms_current_a=1.0", "thermal_time_constant_s=1.0", "measured_deviation_a=1.0"],
          "in A"),
     ])  # fmt: skip

@@ -6,11 +6,12 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilctl.base.device import AuxChannel
 from hilctl.base.errors import InputError
-from hilctl.base.samples import Flag
+from hilctl.base.samples import BlockHeader, Flag
 from hilctl.kernels.interlock import InterlockFlag
-from hilctl.loop.interlocks import Trip, warming
-from tests.fakes import RigInterlocks
+from hilctl.loop.interlocks import AuxLimit, Trip, warming
+from tests.fakes import RigInterlocks, made_block
 
 RATE_HZ = 1000.0
 STROKE = RigInterlocks(stroke_um=(-60.0, 50.0), sensor_um=(-100.0, 100.0))
@@ -74,6 +75,53 @@ class TestStroke:
         limits = RigInterlocks(stroke_um=(-1.0, 2.0))
         assert trips(limits, 1, displacement=np.inf)[0].code == "stroke"
         assert trips(limits, 1, displacement=-np.inf)[0].code == "stroke"
+
+
+class TestAux:
+    FREE, COIL = AuxLimit(AuxChannel("rod_c")), AuxLimit(AuxChannel("coil_c", "°C"), high=80.0)
+    PRELOAD = AuxLimit(AuxChannel("preload_n", "N"), 200.0, 900.0)
+
+    def sample_of_trip(self, values, *, limit=COIL, invalid_s=None, skipped=0):
+        """Feed blocks of 10 samples; return the sample of the trip, None without one."""
+        limits = replace(STROKE, aux=(self.FREE, limit), sensor_invalid_s=invalid_s)
+        interlocks = limits.made(RATE_HZ)
+        for number, value in enumerate(values):
+            block = made_block(10, fill=0.0, aux=2)
+            block.head[BlockHeader.FIRST_SAMPLE] = 10 * number
+            block.skipped = skipped
+            block.aux[1] = value
+            if (trip := interlocks.judge(block)) is not None:
+                assert trip.code == "aux"
+                assert (block.flags == InterlockFlag.AUX).all()
+                return trip.sample
+            assert not block.flags.any()
+        return None
+
+    @pytest.mark.parametrize(
+        ("limit", "values", "sample"),
+        [
+            (COIL, [-1e6, 80.0, 79.0], None),
+            (COIL, [80.0, 80.1], 10),
+            (COIL, [np.inf], 0),
+            (PRELOAD, [200.0, 900.0, 199.0], 20),
+            (FREE, [np.inf, np.nan], None),
+        ],
+    )
+    def test_limits(self, limit, values, sample):
+        assert self.sample_of_trip(values, limit=limit) == sample
+
+    @pytest.mark.parametrize(
+        ("missing", "options", "sample"),
+        [
+            (1, {}, 0),
+            (3, {"invalid_s": 0.03}, None),
+            (4, {"invalid_s": 0.03}, 30),
+            (2, {"invalid_s": 0.03, "skipped": 10}, 10),
+        ],
+    )
+    def test_missing_values_trip_as_invalid_readings(self, missing, options, sample):
+        values = [np.nan] * missing + [20.0, np.nan] * bool(options)
+        assert self.sample_of_trip(values, **options) == sample
 
 
 class TestMissing:

@@ -1,6 +1,8 @@
 """Recordings made of random batches."""
 
 import functools
+import json
+from dataclasses import asdict
 from types import SimpleNamespace
 
 import numpy as np
@@ -8,6 +10,7 @@ import pytest
 from mcap.data_stream import RecordBuilder
 from mcap.records import Chunk, Message
 
+from hilctl.base.device import AuxChannel
 from hilctl.base.events import Event
 from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader, Samples
 from hilctl.base.segments import Segment
@@ -18,6 +21,7 @@ from hilctl.recording.writer import RecordingWriter, RunFacts
 RATE_HZ = 50_000.0
 START_NS = 1_800_000_000_000_000_000
 BLOCK = 50
+AUX = (AuxChannel("coil_c", "°C", "temperature"), AuxChannel("preload_n"))
 SEGMENT = Segment("sine", 0, 5000, 100, 4900, 200.0)
 ENDED = Event(17, "info", "run_ended", "waveform completed", time_ns=START_NS + 5)
 
@@ -37,6 +41,7 @@ def batch(first, blocks, *, dropped=0, seed=0):
         rng.normal(size=(blocks, 4)),
         rng.normal(size=(blocks, len(COLUMNS), BLOCK)),
         rng.integers(0, 31, (blocks, BLOCK)).astype(np.uint32),
+        rng.normal(size=(blocks, len(AUX))),
     )
 
 
@@ -45,7 +50,7 @@ def write(
     finish=True, ended_at=0,
 ):  # fmt: skip
     facts = RunFacts(
-        facts={"compensator": "rdpi"},
+        facts={"compensator": "rdpi", "aux": json.dumps([asdict(each) for each in AUX])},
         segments=(SEGMENT,),
         experiment_yaml="name: x\n",
         model_yaml="model: y\n",

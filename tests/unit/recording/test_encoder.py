@@ -20,7 +20,9 @@ def test_blocks_of_one_sample_are_the_same_message(make):
     heads = np.repeat(whole.heads, size, axis=0)
     heads[:, BlockHeader.FIRST_SAMPLE], heads[:, BlockHeader.SAMPLES] = np.arange(size), 1
     columns = np.ascontiguousarray(whole.columns[0].T[:, :, np.newaxis])
-    ones = BlockBatch(heads, np.repeat(whole.states, size, axis=0), columns, whole.flags.T.copy())
+    whole = replace(whole, aux=np.empty((1, 0)))
+    states, aux = np.repeat(whole.states, size, axis=0), np.empty((size, 0))
+    ones = BlockBatch(heads, states, columns, whole.flags.T.copy(), aux)
     layout = RecordingLayout(50_000.0, "A", True, 1000.0, 1_800_000_000 * 10**9, True)
     block, other = (next(iter(MessageMaker(layout).batch(each))) for each in (whole, ones))
     assert block.topic == "/samples"

@@ -26,6 +26,8 @@ def test_everything_comes_back(recorded, make):
     path, batches = recorded
     back = read(path)
     same_samples(back.samples, make.samples(batches))
+    assert [*back.aux] == ["coil_c", "preload_n"]
+    assert np.array_equal(back.aux["preload_n"], make.samples(batches).aux[:, 1])
     assert back.samples.index.tolist() == [*range(1700), *range(1900, 2050)]
     assert back.dropped == 200
     for name in ("first_sample", "deadline_ns", "late_ns", "exchange_ns"):

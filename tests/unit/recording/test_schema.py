@@ -15,7 +15,7 @@ def test_field_numbers_stay():
     assert {name: " ".join(each.values()) for name, each in numbers.items()} == {
         "SampleBlock": "tick0 n dropped t_rel reference_um wanted_a current_a displacement_um "
         "flags measured_a wanted_v drive_v measured_v state previous_command input_um "
-        "reading_age_s reading_um",
+        "reading_age_s reading_um aux",
         "TickBlock": "first_sample deadline_ns late_ns exchange_ns",
         "Sample": "sample t_rel reference_um wanted_a current_a displacement_um flags wanted_v "
         "drive_v",

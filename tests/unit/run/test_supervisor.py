@@ -65,7 +65,7 @@ class Neighbours:
         self.refused = []
         self.ring = None
         self.info = SimpleNamespace(
-            simulated=False, holds=("tcp:here",), latency_blocks=0, arm_s=0.0
+            simulated=False, holds=("tcp:here",), latency_blocks=0, arm_s=0.0, aux=()
         )
         self.config = SimpleNamespace(
             name="stage",

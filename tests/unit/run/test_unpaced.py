@@ -8,6 +8,8 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilctl.analysis.catalogue import read_catalogue, select
+from hilctl.analysis.export import columns
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
@@ -28,7 +30,10 @@ SHORT = ["waveform.duration_s=0.25", "waveform.frequency_hz=100"]
 
 def plan(block, latency_blocks):
     compensator = SimpleNamespace(state_size=0)
-    return SimpleNamespace(block=block, latency_blocks=latency_blocks, compensator=compensator)
+    return SimpleNamespace(
+        block=block, latency_blocks=latency_blocks, compensator=compensator,
+        interlocks=SimpleNamespace(aux=()),
+    )  # fmt: skip
 
 
 def test_time_passes_in_sleeps_only():
@@ -58,6 +63,24 @@ def test_a_refused_write_costs_nothing(tmp_path, monkeypatch, pending_bytes, wri
     recording = read(result.path)
     assert recording.samples.index.size == result.samples > 0
     assert recording.end["code"] == "completed"
+
+
+@pytest.mark.parametrize(
+    ("settings", "value"),
+    [([], 30.0), (["device.fault={kind: aux_nan, at_sample: 2000}"], np.nan)],
+)
+def test_an_auxiliary_channel_ends_a_run(tmp_path, settings, value):
+    settings += ["device.temperatures={coil_tau_s: 0.2}", "limits.aux={coil_c: 30}"]
+    result = run_unpaced(checked_experiment(UNCOMPENSATED, SHORT + settings), tmp_path / "r.mcap")
+    recording = read(result.path)
+    (fault,) = (each for each in recording.events if each.code == "aux")
+    at = int(np.searchsorted(recording.samples.index, fault.sample))
+    assert (result.code, fault.level) == ("fault", "error")
+    assert recording.aux["coil_c"][at] == pytest.approx(value, abs=0.5, nan_ok=True)
+    assert recording.samples.command[-1] == 0.0
+    highest = select(read_catalogue(tmp_path), "aux.rod_c.max < aux.coil_c.max")[0]["options"]
+    assert highest["aux.coil_c.max"] == np.nanmax(recording.aux["coil_c"])
+    assert [*columns(recording)][-3:] == ["coil_c", "rod_c", "flags"]
 
 
 @pytest.mark.parametrize("latency", [0, 3])

@@ -43,6 +43,28 @@ def wave(n):
     return 3.0 * np.sin(2.0 * np.pi * 200.0 * np.arange(n) / RATE_HZ)
 
 
+TEMPERATURES = {"ambient_c": 20.0, "resistance_ohm": 2.0, "coil_tau_s": 1e-3, "rod_tau_s": 1e-3}
+
+
+class TestTemperatures:
+    def test_end_at_the_loss_of_the_coil_and_move_nothing(self):
+        warm, cold = terfenol(temperatures=TEMPERATURES), terfenol()
+        command = np.full(1000, 3.0)
+        assert warm.aux.tolist() == [20.0, 20.0]
+        np.testing.assert_array_equal(send_all(warm, command), send_all(cold, command))
+        send(warm, 2000, command[:BLOCK])  # skipped samples warm the coil too
+        np.testing.assert_allclose(warm.aux, [20.0 + 2.0 * 9.0, 20.0 + 9.0], atol=0.01)
+        assert [each.name for each in warm.info.aux] == ["coil_c", "rod_c"]
+        assert cold.info.aux == ()
+
+    def test_fault(self):
+        device = terfenol(temperatures=TEMPERATURES, fault={"kind": "aux_nan", "at_sample": BLOCK})
+        send(device, 0, wave(BLOCK))
+        assert np.isfinite(device.aux).all()
+        send(device, BLOCK, wave(BLOCK))
+        assert np.isnan(device.aux).all()
+
+
 class TestVariedRig:
     @pytest.mark.parametrize(("name", "attribute", "power"), [
         ("lag", "lag_s", 1),

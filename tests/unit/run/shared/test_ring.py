@@ -16,7 +16,7 @@ BLOCK, STATE = 3, 2
 
 
 def make(tmp_path, slots=4):
-    return SampleRing.create(tmp_path / "ring", slots=slots, block=BLOCK, state_size=STATE)
+    return SampleRing.create(tmp_path / "ring", slots=slots, block=BLOCK, state_size=STATE, aux=2)
 
 
 def born(ring, number, *, due=True):
@@ -27,7 +27,7 @@ def born(ring, number, *, due=True):
     block.state[:] = -number
     for row in (block.reference, block.wanted, block.command, block.input_um):
         row[:] = number
-    block.columns[ANSWERS] = number
+    block.columns[ANSWERS] = block.aux[:] = number
     block.flags[:] = number
     ring.sending(block)
     return block
@@ -48,6 +48,7 @@ def test_blocks_come_out_as_they_went_in(tmp_path):
     assert batch.columns[1].tolist() == [[2.0] * BLOCK] * len(COLUMNS)
     assert batch.states.tolist() == [[-1.0, -1.0], [-2.0, -2.0]]
     assert batch.flags.tolist() == [[1] * BLOCK, [2] * BLOCK]
+    assert batch.aux.tolist() == [[1.0, 1.0], [2.0, 2.0]]
     assert other.pop() is None
 
 
@@ -187,6 +188,7 @@ def test_blocks_that_were_sent_outlive_their_loop(tmp_path):
     assert batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [6, 9]
     assert batch.heads[:, BlockHeader.DROPPED_BEFORE].tolist() == [1, 0]
     assert np.isnan(batch.columns[:, 3:5]).all()
+    assert np.isnan(batch.aux).all()
     assert (batch.columns[:, 5] == batch.columns[:, 2]).all()
     assert (batch.columns[:, 2] == [[2.0] * BLOCK, [3.0] * BLOCK]).all()
     assert (batch.flags & Flag.UNANSWERED).all()
@@ -264,6 +266,7 @@ def test_slots_are_handed_out_clean(tmp_path):
         assert not block.flags.any()
         assert np.isnan(block.displacement_um).all()
         assert np.isnan(block.measured).all()
+        assert np.isnan(block.aux).all()
         assert push(ring, number + 1)
         if number % 3 != 1:
             other.pop()
