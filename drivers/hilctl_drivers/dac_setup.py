@@ -6,16 +6,19 @@ reader has a link of its own, or shares the line or connection of the output.
 
 import math
 from abc import ABC, abstractmethod
+from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from pkgutil import resolve_name
 from typing import Any, ClassVar, Self, cast
 
-from hilctl.base.device import DeviceInfo
+from hilctl.base.device import AuxChannel, DeviceInfo
 from hilctl.base.errors import InputError
 from hilctl_drivers.device import details_of
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.profile_base import Range
 from hilctl_drivers.signal_chain import (
+    AuxInput,
     DacOptions,
     SignalChain,
     channel,
@@ -24,6 +27,21 @@ from hilctl_drivers.signal_chain import (
 )
 from hilctl_drivers.transport.links import Link, naming
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
+
+
+@dataclass(frozen=True, slots=True)
+class AuxSource:
+    """An auxiliary channel, the device that has its input, and the options."""
+
+    channel: AuxChannel
+    holder: Endpoint
+    input: Range
+    options: AuxInput
+
+    def value(self, reader: "SensorReader") -> float:
+        """Return the value of the channel."""
+        with naming(f"aux.{self.channel.name}"):
+            return reader.read() * self.options.scale + self.options.offset
 
 
 @dataclass(frozen=True, slots=True)
@@ -38,6 +56,7 @@ class DacSetup:
         input: The input in use.
         chain: Amplifier and sensor.
         measure: The input that measures the output; None if it is not measured.
+        aux: The auxiliary channels.
     """
 
     options: DacOptions
@@ -47,6 +66,7 @@ class DacSetup:
     input: Range
     chain: SignalChain
     measure: Any
+    aux: tuple[AuxSource, ...]
 
     @classmethod
     def of(cls, options: DacOptions) -> Self:
@@ -63,7 +83,8 @@ class DacSetup:
         if measure is not None:
             chain.measured(measure)
         check_watchdog(here.title, options, output, chain, here.watchdog)
-        setup = cls(options, writer, reader, output, sensor_input, chain, measure)
+        aux = tuple(_aux_source(*each, reader, writer) for each in (options.aux or {}).items())
+        setup = cls(options, writer, reader, output, sensor_input, chain, measure, aux)
         if setup.reads_elsewhere:
             setup.check_timeout(setup.read_time)
         return setup
@@ -91,15 +112,20 @@ class DacSetup:
     @property
     def read_time(self) -> WireTime:
         """Time of reading the input alone."""
-        return self._reader_class.time(self.reader.profile, self.input)
+        return _reader_class(self.reader).time(self.reader.profile, self.input)
 
     def reader_on(self, link: Link) -> "SensorReader":
         """Return the session that reads the sensor; it uses the output's link if it shares it."""
-        return self._reader_class(self, link)
+        return _reader_class(self.reader)(self, link)
 
-    @property
-    def _reader_class(self) -> "type[SensorReader]":
-        return cast("type[SensorReader]", resolve_name(self.reader.profile.READER))
+    def aux_readers(self, link: Link, reader: "SensorReader | None") -> list[Callable[[], float]]:
+        """Return functions that read the auxiliary channels on the open links."""
+        found: list[Callable[[], float]] = []
+        for each in self.aux:
+            shared = link if each.holder is self.writer or reader is None else reader.link
+            own = replace(self, writer=each.holder, reader=each.holder, input=each.input)
+            found.append(partial(each.value, own.reader_on(shared)))
+        return found
 
     def check_timeout(self, wire: WireTime) -> None:
         """Raise InputError if an answer cannot come within the timeout."""
@@ -108,7 +134,14 @@ class DacSetup:
             raise InputError(f"timeout_s must be > {wire.answered_s:g}, got {timeout_s:g} ({wire})")
 
     def after_reading(self, wire: WireTime) -> WireTime:
-        """Return the time of a sample that ``wire`` writes, and that the reader reads before."""
+        """Return the time of a sample that ``wire`` writes, and that the reader reads before.
+
+        It includes the slowest auxiliary channel.
+        """
+        if self.aux:
+            times = [_reader_class(e.holder).time(e.holder.profile, e.input) for e in self.aux]
+            slowest = max(times, key=lambda each: each.total_s)
+            wire = wire.then(slowest.named("for an auxiliary channel"))
         if not self.reads_elsewhere:
             return wire
         read = self.read_time
@@ -173,9 +206,26 @@ class DacSetup:
             calibration=options.calibration_file,
             holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
             details=details,
-            ages_readings=self._reader_class.AGES,
+            ages_readings=_reader_class(self.reader).AGES,
+            aux=tuple(each.channel for each in self.aux),
             **more,
         )
+
+
+def _reader_class(holder: Endpoint) -> "type[SensorReader]":
+    return cast("type[SensorReader]", resolve_name(holder.profile.READER))
+
+
+def _aux_source(name: str, options: AuxInput, reader: Endpoint, writer: Endpoint) -> AuxSource:
+    """Return an auxiliary channel; raise InputError if no device can read its input."""
+    holders = [each for each in (reader, writer) if _reader_class(each).READS_ANY]
+    for holder in holders:
+        if (source := holder.profile.inputs.get(options.input)) is not None:
+            unit = (source.unit if options.unit is None else options.unit).replace("degC", "°C")
+            return AuxSource(AuxChannel(name, unit, options.meaning), holder, source, options)
+    known = [f"{', '.join(each.profile.inputs)} of {each.profile.title}" for each in holders]
+    has = " or ".join(dict.fromkeys(known)) or "no device here supports auxiliary channels"
+    raise InputError(f"aux.{name}.input must be an input: {has}, got {options.input!r}")
 
 
 class SensorReader(ABC):
@@ -187,6 +237,8 @@ class SensorReader(ABC):
 
     AGES: ClassVar[bool] = False
     """Whether the device sends unasked, so that its readings have an age."""
+    READS_ANY: ClassVar[bool] = True
+    """Whether it can read any input of the device in a request of its own."""
     age_s = math.nan
     """Age of the last reading, if it has one."""
 
@@ -196,7 +248,7 @@ class SensorReader(ABC):
         self._own: Any = None
         if setup.reads_elsewhere and not setup.shares_link:
             self._own = self._new_link(setup.reader)
-        self._link: Link = self._own or link
+        self.link: Link = self._own or link
 
     @staticmethod
     @abstractmethod
@@ -267,7 +319,7 @@ class SessionReader(SensorReader):
     def __init__(self, setup: DacSetup, link: Link) -> None:
         """See :class:`SensorReader`."""
         super().__init__(setup, link)
-        self._session = self.session_on(setup.reader, self._link)
+        self._session = self.session_on(setup.reader, self.link)
         self._read_input = self._session.input_reader(setup.input)
 
     @staticmethod

@@ -9,7 +9,7 @@ exchanges and disconnects.
 import json
 import math
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias
@@ -58,6 +58,8 @@ class DacDevice(ABC):
                 self._curve = curve
         self.aux: F64 = np.full(len(info.aux), np.nan)
         """Newest values of the auxiliary channels."""
+        self._aux_readers: Sequence[Callable[[], float]] = ()
+        self._next_aux = 0
         self._info = info
         self._title = title
         self._action = action
@@ -98,10 +100,14 @@ class DacDevice(ABC):
             self._check_block(block)
             self.check_rate(sample_rate_hz, block)
             self._open(sample_rate_hz, block)
+            self._aux_readers = self._readers_of_aux()
+            for _ in self._aux_readers:
+                self._read_aux()
         except DeviceError as error:
             raise self._failed("open", error, self._release) from None
         self._block = block
         self.transactions -= self._info.ages_readings  # no request to a sensor that sends unasked
+        self.transactions += bool(self._aux_readers)
         if self.transactions:
             details = {**self._info.details, "transactions": str(self.transactions)}
             self._info = replace(self._info, details=details)
@@ -164,6 +170,8 @@ class DacDevice(ABC):
             raise self._out_of_range(command)
         try:
             self._exchange(first_sample, command, displacement_um, measured)
+            if self._aux_readers:
+                self._read_aux()
         except DeviceError as error:
             raise self._failed(self._action, error, self._abandon) from None
         if self._curve is not None:
@@ -207,6 +215,19 @@ class DacDevice(ABC):
             raise self._error("close", str(error)) from None
         finally:
             self._release()
+
+    def _readers_of_aux(self) -> Sequence[Callable[[], float]]:
+        """Return functions that read the auxiliary channels, one per exchange in turn.
+
+        Empty if exchanges fill :attr:`aux`.
+        """
+        return ()
+
+    def _read_aux(self) -> None:
+        """Read the next auxiliary channel."""
+        k = self._next_aux
+        self.aux[k] = self._aux_readers[k]()
+        self._next_aux = (k + 1) % len(self._aux_readers)
 
     def _longest_block(self) -> tuple[int, str]:
         """Return the most samples of an exchange, and the reason as text."""

@@ -126,8 +126,9 @@ class Range(StrictModel):
     ``min`` and ``max`` are the limits of the output or input, not those of its register.
     """
 
-    unit: Literal["V", "A", "mA", "um", "mm", "nm"] = Field(
-        description="unit of the value, min and max; um, mm or nm for an input that is a position"
+    unit: Literal["V", "A", "mA", "um", "mm", "nm", "degC"] = Field(
+        description="unit of the value, min and max; um, mm or nm for an input that is a position,"
+        " degC for a temperature"
     )
     min: float = Field(description="lowest value of the output or input, in unit")
     max: float = Field(description="highest value of the output or input, in unit")

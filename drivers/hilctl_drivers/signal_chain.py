@@ -21,7 +21,7 @@ from hilctl.base.strict import StrictModel
 from hilctl.base.types import F64, CommandUnit
 from hilctl_drivers.device import CalibrationName
 from hilctl_drivers.profile import ProfileName
-from hilctl_drivers.profile_base import Range, Watchdog
+from hilctl_drivers.profile_base import Name, Range, Watchdog
 
 PROFILE = "name of a shipped profile, or path of your own relative to the experiment's folder"
 
@@ -264,6 +264,18 @@ Measure: TypeAlias = Annotated[
 ]
 
 
+class AuxInput(DeviceOptions):
+    """Input of an auxiliary channel, whose value is ``scale`` * reading + ``offset``."""
+
+    input: str = Field(
+        description="input of the device that reads the sensor, otherwise of that with the output"
+    )
+    unit: str | None = Field(default=None, description="unit of the value; default: the input's")
+    scale: float = Field(default=1.0, description="value per unit of the input")
+    offset: float = Field(default=0.0, description="value at input 0")
+    meaning: str = Field(default="", description="comment, kept with each recording")
+
+
 class DacOptions(AddressOptions):
     """Options of every DAC with a profile."""
 
@@ -285,6 +297,11 @@ class DacOptions(AddressOptions):
     )
     calibration: Calibration | CalibrationName | None = Field(
         default=None, description="calibration file to apply, or a note on the last calibration"
+    )
+    aux: dict[Name, AuxInput] | None = Field(
+        default=None,
+        description="auxiliary channels by name, such as coil_c; one of them is read per sample, in"
+        " turn, which costs one more request",
     )
     watchdog: WatchdogOptions | Literal["none"] = Field(
         description="the device's own; none if the device may hold its last output"

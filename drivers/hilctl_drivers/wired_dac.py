@@ -7,6 +7,7 @@ last reply has come, and the line is drained after a timeout.
 """
 
 from abc import abstractmethod
+from collections.abc import Callable, Sequence
 from pkgutil import resolve_name
 from typing import Any, ClassVar
 
@@ -104,6 +105,9 @@ class WiredDac(DacDevice):
 
     def _run_feed_steps(self) -> None:
         """Run the steps that feed the watchdog, if it has any."""
+
+    def _readers_of_aux(self) -> Sequence[Callable[[], float]]:
+        return self._setup.aux_readers(self._link, self._reader)
 
     def _output(self) -> float | None:
         held = self._held()

@@ -67,12 +67,14 @@ def _wire_time(profile: FrameProfile, sizes: tuple[int, int]) -> WireTime:
 class BoardReader(SensorReader):
     """A :class:`~hilctl_drivers.dac_setup.SensorReader` for boards, by STATE."""
 
+    READS_ANY = False
+
     def __init__(self, setup: DacSetup, link: Link) -> None:
         """See :class:`~hilctl_drivers.dac_setup.SensorReader`."""
         super().__init__(setup, link)
         profile = setup.reader.profile
         assert isinstance(profile, FrameProfile)
-        self._session = BoardSession(profile, self._link)
+        self._session = BoardSession(profile, self.link)
 
     @staticmethod
     def time(profile: FrameProfile, source: Range) -> WireTime:

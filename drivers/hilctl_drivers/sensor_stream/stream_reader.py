@@ -105,6 +105,7 @@ class StreamReader(SensorReader):
     """A :class:`~hilctl_drivers.dac_setup.SensorReader` that takes the newest sample."""
 
     AGES = True
+    READS_ANY = False
 
     def __init__(self, setup: DacSetup, link: Link) -> None:
         """See :class:`~hilctl_drivers.dac_setup.SensorReader`."""

@@ -201,6 +201,19 @@ def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a)
     assert np.isfinite(displacement_um).all()
 
 
+def test_auxiliary_channels_of_either_device(rig):
+    aux = {"sensor_v": {"input": "AI101"}, "coil_a": {"input": "current", "scale": -1.0}}
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True, aux=aux)
+    assert "for an auxiliary channel" in bench.device.info.rate_note
+    bench.device.open(10.0, 1)
+    assert np.isfinite(bench.device.aux).all()
+    reading = np.empty(1)
+    for sample in range(4):
+        bench.device.exchange(sample, np.array([2.5]), reading, np.empty(1))
+    assert bench.device.aux[1] == pytest.approx(-2.5, abs=1e-3)
+    assert bench.device.aux[0] == pytest.approx(reading[0] / 12.5, abs=0.1)
+
+
 def test_a_reader_that_fails_is_named(rig):
     bench = rig("kepco_bop", reader="agilent_34970a", own_line=True, timeout_s=SILENCE_S)
     bench.open()

@@ -24,7 +24,7 @@ def test_field_numbers_stay():
         "value_names values before_measured_a before_measured_v before_input_um "
         "before_reading_age_s before_reading_um",
     }
-    assert list(numbers["SampleBlock"]) == list(range(1, 19))
+    assert list(numbers["SampleBlock"]) == list(range(1, 20))
     assert list(numbers["Sample"]) == list(range(1, 10))
     assert list(numbers["Event"]) == list(range(1, 20))
 

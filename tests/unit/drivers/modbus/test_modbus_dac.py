@@ -530,3 +530,40 @@ class TestPlaces:
             "profile.yaml": shipped["icp_m7024"].read_text(),
             "reader_profile.yaml": shipped["icp_m7017"].read_text(),
         }
+
+
+class TestAux:
+    INPUTS = "".join(
+        f"\n  {name}: {{address: {at}, type: uint16, unit: {unit}, min: 0.0, max: 999.0}}"
+        for name, at, unit in (("TEMP", 20, "degC"), ("FORCE", 21, "V"))
+    )
+    AUX = (("coil_c", {"input": "TEMP"}),
+           ("preload_n", {"input": "FORCE", "scale": 2.0, "offset": 1.0, "unit": "N"}))  # fmt: skip
+
+    def test_one_channel_per_exchange_in_turn(self, driven, variant):
+        profile = variant((END, f"max: 10.0}}{self.INPUTS}\nwatchdog"))
+        made = driven(profile, aux=dict(self.AUX))
+        inputs, device = made.emulated.device._inputs, made.device
+        inputs["TEMP"].value, inputs["FORCE"].value = 40.0, 50.0
+        made.open()
+        assert [(each.name, each.unit) for each in device.info.aux] == [
+            ("coil_c", "°C"), ("preload_n", "N"),
+        ]  # fmt: skip
+        found = [device.aux.tolist()]
+        inputs["TEMP"].value, inputs["FORCE"].value = 60.0, 70.0
+        for _ in range(2):
+            made.exchange(0.0)
+            found.append(device.aux.tolist())
+        assert found == [[40.0, 101.0], [60.0, 101.0], [60.0, 141.0]]
+
+    def test_it_costs_one_request_a_sample(self):
+        bare, aux = made(), made(aux={"coil_c": {"input": "AIN2"}})
+        assert aux.info.max_rate_hz == pytest.approx(0.5 * bare.info.max_rate_hz)
+
+    @pytest.mark.parametrize(("changes", "words"), [
+        ({"aux": {"coil_c": {"input": "AIN99"}}}, r"aux.coil_c.input.*AIN2.*LabJack T7.*'AIN99'"),
+        ({"aux": {"t_s": {"input": "AIN2"}}}, "aux.t_s"),
+    ])  # fmt: skip
+    def test_refused(self, changes, words):
+        with pytest.raises(InputError, match=words):
+            made(**changes)

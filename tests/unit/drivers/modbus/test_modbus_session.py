@@ -174,7 +174,7 @@ class TestReader:
         exchange(device, 1.0)
         reader, released = device._reader, []
         served.emulator.wires[1].devices = []
-        reader._link.timeout_s = 0.2
+        reader.link.timeout_s = 0.2
         reader.release = lambda: released.append(served.events()[-1]["current_a"])
         with pytest.raises(DeviceError, match="reader agilent_34970a"):
             exchange(device, 1.0)
