@@ -41,7 +41,11 @@ class AuxSource:
     def value(self, reader: "SensorReader") -> float:
         """Return the value of the channel."""
         with naming(f"aux.{self.channel.name}"):
-            return reader.read() * self.options.scale + self.options.offset
+            return self.scaled(reader.read())
+
+    def scaled(self, reading: float) -> float:
+        """Return the value of the channel for a reading of its input."""
+        return reading * self.options.scale + self.options.offset
 
 
 @dataclass(frozen=True, slots=True)

@@ -96,6 +96,7 @@ class LabJackStream:
         self._limits = profile.outputs[output].limits
         self._target = profile.wire_address(profile.outputs[output])
         self._source = profile.wire_address(profile.inputs[sensor])
+        self._inputs = 1
         self._analog = {profile.wire_address(each) for each in profile.inputs.values()}
         self.fifo = SampleFifo(bench.rig.actuator, repeats=True, on_played=self._played)
         self._on_played = on_played
@@ -130,7 +131,9 @@ class LabJackStream:
 
     def _played(self, first: int, command: F64, displacement_um: F64, now_ns: int) -> None:
         self._on_played(first, command, now_ns)
-        self.input.keep(self._wiring.at_terminal(displacement_um))
+        volts = np.zeros((displacement_um.size, self._inputs))  # other inputs are at 0 V
+        volts[:, 0] = self._wiring.at_terminal(displacement_um)
+        self.input.keep(volts.ravel())
 
     def stop(self, now_ns: int) -> None:
         """Stop streaming at a time that may be past; the output holds its value."""
@@ -207,11 +210,15 @@ class LabJackStream:
         if not starts:
             self.fifo.stop()
             return
-        found = [self._number(stream.SCANLIST_ADDRESS + 2 * k) for k in range(2)]
-        found += [self._number(stream.NUM_ADDRESSES), self._number(stream.AUTO_TARGET)]
-        wanted = [self._source, stream.STREAM_OUT0, 2, stream.COMMAND_RESPONSE]
+        count = self._number(stream.NUM_ADDRESSES)
+        _require(2 <= count <= len(self._analog) + 1, _FAILURE_EXCEPTION)
+        scanned = [self._number(stream.SCANLIST_ADDRESS + 2 * k) for k in range(count)]
+        found = scanned[:1] + scanned[-1:] + [self._number(stream.AUTO_TARGET)]
+        wanted = [self._source, stream.STREAM_OUT0, stream.COMMAND_RESPONSE]
         (rate_hz,) = struct.unpack(">f", self._words[stream.SCANRATE_HZ])
-        allowed = 0.0 < rate_hz <= self._streaming.rate_max_hz
+        self._inputs = count - 1
+        allowed = 0.0 < rate_hz <= self._streaming.rate_max_hz(self._inputs)
+        allowed &= self._analog.issuperset(scanned[:-1])
         _require(allowed and found == wanted, _FAILURE_EXCEPTION)
         self.input.start(self._number(stream.BUFFER_SIZE_BYTES))
         self.fifo.command = self._rig.command

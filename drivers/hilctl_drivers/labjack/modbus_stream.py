@@ -39,9 +39,9 @@ _MARGIN_SCANS = 2
 
 
 class StreamSession:
-    """One stream of one device: an output played from its buffer, an input read in each scan.
+    """One stream of one device: an output played from its buffer, inputs read in each scan.
 
-    The count of scans is the clock. Value number k is output in scan k, and reading k is taken just
+    The count of scans is the clock. Value number k is output in scan k, and its inputs are read just
     before. This holds as long as the output's buffer never runs dry, which each message checks
     before its own values come. Every error is a ``DeviceError``.
 
@@ -67,6 +67,7 @@ class StreamSession:
         self.capacity = 0
         """Values that the output's empty buffer holds."""
         self._parts: list[npt.NDArray[np.uint16]] = []
+        self._inputs = 1
         self.running = False
         self._begin(0.0)
 
@@ -84,7 +85,7 @@ class StreamSession:
         if self._read_u32(stream.ENABLE):
             self._write((stream.ENABLE, u32(0)))
 
-    def prepare(self, rate_hz: float, target: int, source: int) -> None:
+    def prepare(self, rate_hz: float, target: int, sources: Sequence[int]) -> None:
         """Set buffers, scan list and clock of a stopped stream; nothing moves before :meth:`start`.
 
         The device must make the rate to 100 ppm.
@@ -100,18 +101,19 @@ class StreamSession:
         self.capacity = self._read_u32(stream.OUT_BUFFER_STATUS)
         self._write(
             (stream.SCANRATE_HZ, f32(rate_hz)),
-            (stream.NUM_ADDRESSES, u32(2)),
+            (stream.NUM_ADDRESSES, u32(len(sources) + 1)),
             (stream.SETTLING_US, f32(0.0)),
             (stream.RESOLUTION_INDEX, u32(0)),
             (stream.BUFFER_SIZE_BYTES, size),
             (stream.AUTO_TARGET, u32(stream.COMMAND_RESPONSE)),
             (stream.DATATYPE, u32(0)),
             (stream.NUM_SCANS, u32(0)),
-            (stream.SCANLIST_ADDRESS, u32(source) + u32(stream.STREAM_OUT0)),
+            (stream.SCANLIST_ADDRESS, b"".join(map(u32, (*sources, stream.STREAM_OUT0)))),
         )
         real_hz = float(np.frombuffer(self._feedback.read(stream.SCANRATE_HZ, 2), ">f4")[0])
         if not math.isclose(real_hz, rate_hz, rel_tol=_RATE_TOLERANCE):
             raise DeviceError(f"scan rate was set to {rate_hz:g} Hz, the device makes {real_hz:g}")
+        self._inputs = len(sources)
         self._begin(rate_hz)
 
     def _begin(self, rate_hz: float) -> None:
@@ -149,13 +151,15 @@ class StreamSession:
             self._queued += part.size
 
     def take(self, count: int) -> npt.NDArray[np.uint16]:
-        """Return the next ``count`` readings, uint16[count]; wait for the device's clock."""
-        deadline = self._clock() + count / self._rate_hz + self._timeout_s
+        """Return the next ``count`` scans, uint16[count * inputs]; wait for the device's clock."""
+        count *= self._inputs
+        rate_hz = self._rate_hz * self._inputs
+        deadline = self._clock() + count / rate_hz + self._timeout_s
         while self._waiting < count:
             # No more than one answer's worth, so that the last answer is not many.
             wanted = min(count - self._waiting, stream.SAMPLES_MAX)
             if wanted > self._backlog:
-                self._sleep((wanted - self._backlog) / self._rate_hz)
+                self._sleep((wanted - self._backlog) / rate_hz)
             self._exchange(())
             # A device that still has readings is in time: the host has stalled.
             if self._waiting < count and not self._backlog and self._clock() > deadline:
@@ -178,7 +182,7 @@ class StreamSession:
 
     def _check_level(self, held: int) -> None:
         """Raise if the output's buffer ran dry, or holds another number of values than expected."""
-        level = self._queued - self._fetched - self._backlog
+        level = self._queued - (self._fetched + self._backlog) // self._inputs
         self.level_min = min(self.level_min, level)
         if level < self.margin:
             where = f"at sample {self._queued}; raise device.fifo_blocks"
@@ -202,14 +206,14 @@ def _shortage(level: int) -> str:
     return f"only {level} values were left, too few to be sure that each was output in time"
 
 
-def stream_messages(block: int) -> int:
-    """Return the messages of a block: those with its values, and one that waits for the clock."""
-    return math.ceil(block / VALUES_MAX) + 1
+def stream_messages(block: int, inputs: int = 1) -> int:
+    """Return the messages of a block: its values or readings, and one that waits for the clock."""
+    return max(math.ceil(block / VALUES_MAX), math.ceil(block * inputs / stream.SAMPLES_MAX)) + 1
 
 
-def stream_time(profile: ModbusProfile, block: int) -> WireTime:
+def stream_time(profile: ModbusProfile, block: int, inputs: int = 1) -> WireTime:
     """Return the time of a block; readings come back in the messages that bring values."""
-    messages = stream_messages(block)
+    messages = stream_messages(block, inputs)
     what = f"{block} samples in {messages} messages over TCP"
     return WireTime(what, 0.0, 0.0, 0, 0.0, messages * profile.turnaround_s, block)
 
@@ -239,7 +243,7 @@ class ModbusStream(ModbusDevice):
         super().__init__(options, link)
         self._sleep, self._clock = sleep, clock
         self._stream: StreamSession | None = None
-        self._calibration: InputCalibration | None = None
+        self._calibrations: list[InputCalibration] = []
         self._next_sample = 0
 
     def _prepare(self) -> None:
@@ -250,14 +254,18 @@ class ModbusStream(ModbusDevice):
             raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
         if self._setup.reads_elsewhere:
             raise InputError("reader must be omitted: input and output are in one scan list")
+        aux = options.aux or {}
         for what, name, known in (
             ("output", options.output, streaming.outputs),
             ("input", options.input, streaming.inputs),
+            *((f"aux.{name}.input", each.input, streaming.inputs) for name, each in aux.items()),
         ):
             if name not in known:
                 rule = f"{what} must be one that {profile.title} can stream, {', '.join(known)}"
                 raise InputError(f"{rule}, got {name!r}")
         self._streaming = streaming
+        inputs = (self._setup.input, *(each.input for each in self._setup.aux))
+        self._sources = [profile.wire_address(cast(ModbusInput, each)) for each in inputs]
         self.fifo_depth = streaming.fifo_depth
         self.block_max = max(1, streaming.fifo_depth // (options.fifo_blocks + 1))
 
@@ -272,11 +280,12 @@ class ModbusStream(ModbusDevice):
 
     def _rates(self, block: int) -> RateLimit:
         streaming, settle_s = self._streaming, self._target.settle_s
-        most_hz, per_s = streaming.rate_max_hz, streaming.samples_per_s_max
-        whose = f"{per_s:g} samples a second for an input and an output: its profile"
+        inputs, per_s = len(self._sources), streaming.samples_per_s_max
+        most_hz, whose = streaming.rate_max_hz(inputs), f"{per_s:g} samples a second for"
+        whose += f" {inputs} input{'s' * (inputs > 1)} and an output: its profile"
         if settle_s * most_hz > 1.0:
             most_hz, whose = 1.0 / settle_s, f"settling {settle_s * 1e3:.2f} ms: its profile"
-        wire = stream_time(self._profile, block)
+        wire = stream_time(self._profile, block, inputs)
         return RateLimit.of(wire, most_hz, whose, streaming.rate_min_hz)
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
@@ -300,14 +309,16 @@ class ModbusStream(ModbusDevice):
         stream.stop()  # also one of another program: a running stream accepts no settings
         writer.run(profile.init)
         writer.run(streaming.setup)
-        source = profile.wire_address(cast(ModbusInput, self._setup.input))
-        self._calibration = stream.calibration(source // 2)
-        stream.prepare(sample_rate_hz, profile.wire_address(self._target), source)
+        self._calibrations = [stream.calibration(source // 2) for source in self._sources]
+        stream.prepare(sample_rate_hz, profile.wire_address(self._target), self._sources)
         check_fifo(block, self._options.fifo_blocks, stream.capacity)
         self._try_out_safe_value()
         self._stream = stream
         self._next_sample = 0
-        self.transactions = stream_messages(block)
+        self.transactions = stream_messages(block, len(self._sources))
+
+    def _readers_of_aux(self) -> Sequence[Callable[[], float]]:
+        return ()  # they are in the scan list
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
@@ -325,18 +336,20 @@ class ModbusStream(ModbusDevice):
         if self._feed_every:
             self._feed()
         if readings is not None:
-            self._chain.fill_um(readings, displacement_um)
+            self._chain.fill_um(readings[0], displacement_um)
+            for k, source in enumerate(self._setup.aux):
+                self.aux[k] = source.scaled(float(readings[k + 1].mean()))
 
-    def _readings(self, stream: StreamSession, block: int) -> F64 | None:
-        """Return a block's volts, float64[B]; None before the first one is due."""
+    def _readings(self, stream: StreamSession, block: int) -> list[F64] | None:
+        """Return a block's volts of each input, float64[B]; None before the first one is due."""
         kept = self._options.fifo_blocks * block
         if self._next_sample < kept:
             return None
         if self._next_sample == kept:
             stream.start()
             return None
-        assert self._calibration is not None
-        return self._calibration.volts(stream.take(block))
+        scans = stream.take(block).reshape(block, -1)
+        return [each.volts(scans[:, k]) for k, each in enumerate(self._calibrations)]
 
     def _write(self, data: bytes) -> None:
         feedback = ModbusFeedback(self._link, self._writer.unit)

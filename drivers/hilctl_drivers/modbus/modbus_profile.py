@@ -64,10 +64,9 @@ class LabJackStreaming(StrictModel):
         """Samples that the output's buffer holds."""
         return self.buffer_bytes // BYTES_A_SAMPLE
 
-    @property
-    def rate_max_hz(self) -> float:
-        """Highest scan rate with one output and one input in the scan list, Hz."""
-        return self.samples_per_s_max / 2.0
+    def rate_max_hz(self, inputs: int) -> float:
+        """Return the highest scan rate with one output and some inputs in the scan list, Hz."""
+        return self.samples_per_s_max / (1 + inputs)
 
 
 GAP_CHARS = 3.5

@@ -116,15 +116,21 @@ def test_says_that_it_streams(driven):
     assert info.details["fifo_level"] == f"{FIFO_BLOCKS} blocks"
 
 
+@pytest.mark.parametrize("channels", [0, 2])
 @pytest.mark.parametrize("profile", ["labjack_t7", "labjack_t4"])
-def test_each_displacement_belongs_to_its_command(driven, profile):
-    made = driven(profile=profile)
+def test_each_displacement_belongs_to_its_command(driven, profile, channels):
+    inputs = load_profile(profile).streaming.inputs[1 : 1 + channels]
+    aux = {f"aux_{name}": {"input": name, "scale": 9.0, "offset": 25.0} for name in inputs}
+    made = driven(profile=profile, aux=aux)
     made.open()
     commands = sine(20 * BLOCK)
     back = [made.exchange(part) for part in np.split(commands, 20)]
     assert np.isnan(np.concatenate(back[:FIFO_BLOCKS])).all()
     found = np.concatenate(back[FIFO_BLOCKS:])
     assert found == pytest.approx(alone(commands[: found.size]), abs=0.51 * LSB_UM * 1.03)
+    assert made.device.aux.tolist() == pytest.approx([25.0] * channels, abs=0.01)
+    per_s = load_profile(profile).streaming.samples_per_s_max
+    assert made.device.info.max_rate_hz == pytest.approx(per_s / (2 + channels))
 
 
 def test_nothing_moves_before_the_fifo_is_filled(driven):
@@ -461,7 +467,7 @@ def scene():
         session = StreamSession(
             device, profile.streaming, 0.1, turnaround_s, slept_s.append, lambda: sum(slept_s)
         )
-        session.prepare(STREAM_HZ, DAC0, AIN0)
+        session.prepare(STREAM_HZ, DAC0, [AIN0])
         session.feed(np.zeros(queued))
         return Scene(session, device, slept_s)
 
@@ -579,7 +585,7 @@ def test_readings_of_the_stream_before_are_forgotten(scene):
     made.session.take(10)
     made.session.stop()
     made.device.fed = 0
-    made.session.prepare(STREAM_HZ, DAC0, AIN0)
+    made.session.prepare(STREAM_HZ, DAC0, [AIN0])
     made.session.feed(np.zeros(100))
     made.session.start()
     assert made.session.take(10).tolist() == list(range(50, 60))

@@ -38,7 +38,7 @@ def text():
 
 def test_rate_and_depth_follow_from_the_device_s_own_figures(text):
     streaming = parse_profile(text, "here").streaming
-    assert (streaming.fifo_depth, streaming.rate_max_hz) == (8192, 50_000.0)
+    assert (streaming.fifo_depth, streaming.rate_max_hz(1)) == (8192, 50_000.0)
 
 
 @pytest.mark.parametrize(("name", "old", "new", "rule"), [
