@@ -233,7 +233,8 @@ class View:
 def _facts(status: dict[str, Any]) -> tuple[str, str]:
     known = {key: value for key, value in status["figures"].items() if value is not None}
     late = status["lateness_us"]
-    figures = (f"{name} {known[key]:5.2f} {unit}" for name, key, unit in _FIGURES if key in known)
+    figures = [f"{name} {known[key]:5.2f} {unit}" for name, key, unit in _FIGURES if key in known]
+    figures += [f"{e['name']} {e['value']:.4g} {e['unit']}" for e in status["aux"]]
     wakes = f"  p99 {late['p99']:.0f} us  latest {late['max']:.0f} us" if late else ""
     return "  ".join(figures), f"late ticks {status['late_ticks']}{wakes}"
 

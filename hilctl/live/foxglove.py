@@ -140,6 +140,7 @@ def _statuses(status: dict[str, Any]) -> list[dict[str, Any]]:
     parts: list[tuple[str, str, str, dict[str, Any]]] = [
         ("run", "error" if failed else "info", state, {key: status[key] for key in keys}),
         ("figures", "info", "newest cycles", status["figures"]),
+        ("auxiliary", "info", "", {each["name"]: each["value"] for each in status["aux"]}),
         ("lateness", "info", "", {**late, "late_ticks": status["late_ticks"]}),
         ("recording", "info", "", {**missed, **(status["disk"] or {})}),
     ]

@@ -13,7 +13,7 @@ import numpy as np
 from hilctl.base.samples import NO_WAVEFORM, BlockBatch, BlockHeader, Flag
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64
-from hilctl.live.scope import ROW, Traces
+from hilctl.live.scope import ROW, SIGNALS, Traces
 from hilctl.run.metadata import LimitBounds, RunDescription
 from hilctl.signals.cycle_metrics import sensor_noise_um
 from hilctl.signals.segment_metrics import SegmentMetrics
@@ -56,7 +56,9 @@ class Headroom:
         self._heat_a2 = self._limits.heat_a2
         self._before: F64 | None = None
         self._next_sample = 0
-        self._held: dict[str, list[tuple[int, Gauge]]] = {name: [] for name in _HELD}
+        self._aux = [*enumerate(description.aux, len(SIGNALS))]
+        names = (*_HELD, *(each.name for _, each in self._aux))
+        self._held: dict[str, list[tuple[int, Gauge]]] = {name: [] for name in names}
 
     def add(self, traces: Traces) -> None:
         """Add the next samples."""
@@ -71,6 +73,11 @@ class Headroom:
         self._range("displacement", traces.values[ROW["displacement"]], limits.stroke_um, "um")
         self._most("tracking error", traces.values[ROW["error"]], limits.tracking_error_um, "um")
         self._most("measured - command", measured - command, limits.measured_deviation, unit)
+        for row, each in self._aux:
+            if each.low is None:
+                self._most(each.name, traces.values[row], each.high, each.unit)
+            elif each.high is not None:
+                self._range(each.name, traces.values[row], [each.low, each.high], each.unit)
         if limits.rms_current_a is not None:
             self._warm(np.fmax(np.abs(command), np.abs(measured)))
 

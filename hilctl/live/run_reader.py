@@ -18,6 +18,7 @@ import numpy as np
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
+from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.live.live_metrics import (
     EDGES_US,
@@ -27,7 +28,7 @@ from hilctl.live.live_metrics import (
     LiveErrorSpectrum,
     RunningFigures,
 )
-from hilctl.live.scope import SIGNALS, WINDOWS_S, Scope, Traces, traces_of
+from hilctl.live.scope import SIGNALS, WINDOWS_S, Scope, Signal, Traces, traces_of
 from hilctl.run.control.client import active_runs
 from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import RunFolder
@@ -44,6 +45,7 @@ class RunReader:
 
     Attributes:
         events: Its newest events, the oldest first.
+        signals: Its signals, in the order of their rows.
         missed: Number of samples not read: dropped by the run, or overwritten too early.
         ended: Whether the run has ended and no data can follow.
 
@@ -59,7 +61,10 @@ class RunReader:
         except (OSError, ValueError) as error:
             raise RunError(f"{folder.card.name}: cannot read the run: {error}") from None
         self._page = self._ring.page
-        self.scope = Scope(self.description.sample_rate_hz, [], self.loop_input)
+        aux = (Signal(each.name, each.name, each.unit) for each in self.description.aux)
+        self.signals = (*SIGNALS, *aux)
+        self.scope = self._new_scope([])
+        self._aux: list[float] = []
         self._waveform_at = -1
         self._figures = RunningFigures(self.description.sample_rate_hz, self.loop_input)
         self.spectrum = LiveErrorSpectrum(self.description.sample_rate_hz)
@@ -104,13 +109,18 @@ class RunReader:
         if self._waveform_at < 0:
             self._waveform_at = self._page.get(PageField.WAVEFORM_AT)
             segments = self.description.segments_at(self._waveform_at)
-            self.scope = Scope(self.description.sample_rate_hz, segments, self.loop_input)
+            self.scope = self._new_scope(segments)
+
+    def _new_scope(self, segments: list[Segment]) -> Scope:
+        rate_hz = self.description.sample_rate_hz
+        return Scope(rate_hz, segments, self.loop_input, len(self.signals))
 
     def _take(self, traces: Traces) -> None:
         if self._next_sample >= 0:
             self.missed += int(traces.index[-1]) + 1 - self._next_sample - traces.index.size
         self._next_sample = int(traces.index[-1]) + 1
         self.scope.add(traces)
+        self._aux = traces.values[len(SIGNALS) :, -1].tolist()
         self._figures.add(traces, self.scope.segment)
         self.spectrum.add(traces)
         self._headroom.add(traces)
@@ -164,6 +174,10 @@ class RunReader:
             "total_s": (self.description.samples + max(self._waveform_at, 0)) / rate_hz,
             "segment": self.scope.segment.label if self.scope.segment else "",
             "figures": self._figures.newest,
+            "aux": [
+                {"name": each.name, "unit": each.unit, "value": value}
+                for each, value in zip(self.description.aux, self._aux, strict=False)
+            ],
             "gain": page.get_float(PageField.TUNE_GAIN) if tuned else 1.0,
             "offset": page.get_float(PageField.TUNE_OFFSET) if tuned else 0.0,
             "inverse": self.inverse,
@@ -269,7 +283,7 @@ def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
     facts = {
         "mode": "cycle" if cycles else "roll",
         "n": window.t_s.size,
-        "signals": len(SIGNALS),
+        "signals": window.buckets.low.shape[0],
         "loop": loops.shape[1],
         "cycle": scope.points_a_cycle(),
     }
@@ -319,7 +333,7 @@ def frames_of(
         events, seen = feed.events_since(seen)
         window = feed.scope.rolling(window_s)
         low, high = (
-            {signal.name: values[row] for row, signal in enumerate(SIGNALS)}
+            {signal.name: values[row] for row, signal in enumerate(feed.signals)}
             for values in (window.buckets.low, window.buckets.high)
         )
         yield RunFrame(feed.status(), events, window.t_s, low, high)

@@ -2,7 +2,6 @@
 
 import math
 from dataclasses import dataclass
-from typing import Literal
 
 import numpy as np
 
@@ -13,11 +12,14 @@ from hilctl.base.types import F64, I64, U32
 
 @dataclass(frozen=True, slots=True)
 class Signal:
-    """One signal: name for programs, label to display, and ``um`` or the unit of the commands."""
+    """One signal: name for programs, label to display, and unit.
+
+    The unit is ``um``, ``command`` for that of the commands, or the text of an auxiliary channel's.
+    """
 
     name: str
     label: str
-    unit: Literal["um", "command"]
+    unit: str
 
 
 SIGNALS = (
@@ -28,7 +30,8 @@ SIGNALS = (
     Signal("measured", "measured command", "command"),
     Signal("wanted", "command before the limiter", "command"),
 )
-"""The signals; their order is that of the rows of every array of signals."""
+"""The signals of every run; their order is that of the rows of every array of signals. The
+auxiliary channels of a run follow."""
 ROW = {signal.name: row for row, signal in enumerate(SIGNALS)}
 
 
@@ -38,7 +41,7 @@ class Traces:
 
     Attributes:
         index: int64[n], sample index since the start of the run; a jump is a gap.
-        values: float64[len(SIGNALS), n]; NaN if there is no value.
+        values: float64[signals, n]; NaN if there is no value.
         flags: uint32[n], bits of :class:`hilctl.base.samples.Flag`.
     """
 
@@ -66,6 +69,8 @@ def traces_of(batch: BlockBatch, waveform_unit: str) -> Traces:
     values = np.array(
         (reference, displacement_um, error_um, samples.command, samples.measured, samples.wanted)
     )
+    if samples.aux.size:
+        values = np.concatenate((values, samples.aux.T))
     values[~np.isfinite(values)] = np.nan
     return Traces(samples.index, values, samples.flags)
 
@@ -86,7 +91,7 @@ class Buckets:
     """Consecutive buckets of samples.
 
     Attributes:
-        low: Minimum of each signal, float64[len(SIGNALS), n]; NaN if a bucket has no sample.
+        low: Minimum of each signal, float64[signals, n]; NaN if a bucket has no sample.
         high: Maximum of each signal, same shape.
         first: Values of the first sample of each bucket, same shape.
     """
@@ -105,13 +110,14 @@ class MinMaxTrace:
         origin: First sample of bucket 0.
         width: Samples per bucket, >= 1, may be fractional.
         keep: Number of stored buckets.
+        signals: Number of signals.
     """
 
-    def __init__(self, origin: float, width: float, keep: int) -> None:
+    def __init__(self, origin: float, width: float, keep: int, signals: int = len(SIGNALS)) -> None:
         self.origin, self.width, self.keep = origin, width, keep
         self.newest = -1
         """Number of the newest bucket with a sample; -1 before the first."""
-        self._stored = np.full((3, len(SIGNALS), keep), np.nan)  # low, high, first
+        self._stored = np.full((3, signals, keep), np.nan)  # low, high, first
 
     def add(self, traces: Traces) -> None:
         """Add the next samples; ignore those before the origin or the newest bucket."""
@@ -164,14 +170,21 @@ class Scope:
         sample_rate_hz: Samples per second.
         segments: Segments of the run, in order.
         loop_input: Signal on the abscissa of the loop.
+        signals: Number of signals.
     """
 
-    def __init__(self, sample_rate_hz: float, segments: list[Segment], loop_input: str) -> None:
+    def __init__(
+        self,
+        sample_rate_hz: float,
+        segments: list[Segment],
+        loop_input: str,
+        signals: int = len(SIGNALS),
+    ) -> None:
         self._rate_hz = sample_rate_hz
-        self._segments, self._input = segments, ROW[loop_input]
+        self._segments, self._input, self._signals = segments, ROW[loop_input], signals
         self._rolling = {
             window_s: MinMaxTrace(
-                0, max(1, math.ceil(window_s * sample_rate_hz / BUCKETS)), BUCKETS
+                0, max(1, math.ceil(window_s * sample_rate_hz / BUCKETS)), BUCKETS, signals
             )
             for window_s in WINDOWS_S
         }
@@ -202,7 +215,7 @@ class Scope:
         width = max(1.0, samples / _CYCLE_BUCKETS)
         self._cycle_buckets = here.period / width if here.period > 0.0 else _CYCLE_BUCKETS
         keep = math.ceil((CYCLES + 2) * self._cycle_buckets)
-        self._cycles = MinMaxTrace(here.start, width, keep)
+        self._cycles = MinMaxTrace(here.start, width, keep, self._signals)
 
     def rolling(self, window_s: float) -> ScopeWindow:
         """Return the newest ``window_s``, one of :data:`WINDOWS_S`."""

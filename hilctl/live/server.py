@@ -40,7 +40,6 @@ from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl.base.formatting import finite_json, printable
 from hilctl.base.strict import StrictModel, first_problem
 from hilctl.live.run_reader import RunList, RunReader, ScopeMode, frame_of, nearest_window_s
-from hilctl.live.scope import SIGNALS
 from hilctl.run.control.client import ask, request_stop
 from hilctl.run.run_folder import RunFolder
 
@@ -401,7 +400,7 @@ class LiveServer:
             state |= feed.status() | {
                 "spectrum": {"hz": hz.tolist(), "um": um.tolist()},
                 "description": feed.description.model_dump(),
-                "signals": [[each.name, each.label, each.unit] for each in SIGNALS],
+                "signals": [[each.name, each.label, each.unit] for each in feed.signals],
             }
         return finite_json(state)
 

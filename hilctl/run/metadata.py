@@ -22,6 +22,7 @@ from hilctl.base.samples import COLUMNS, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import dump
+from hilctl.experiment.device_rules import interlock_context
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.diagnosis import machine_facts
@@ -156,6 +157,15 @@ class LimitBounds(StrictModel):
     late_s: float
 
 
+class AuxBounds(StrictModel):
+    """An auxiliary channel and its limits; None: no limit."""
+
+    name: str
+    unit: str
+    low: float | None
+    high: float | None
+
+
 class RunDescription(StrictModel):
     """Description of a run for watchers."""
 
@@ -172,6 +182,7 @@ class RunDescription(StrictModel):
     samples: int
     segments: list[Segment]  # from the waveform's first sample
     limits: LimitBounds
+    aux: list[AuxBounds]
     settings: list[SettingRow]
 
     @classmethod
@@ -193,6 +204,15 @@ class RunDescription(StrictModel):
             samples=int(reference.values.size),
             segments=list(reference.segments),
             limits=_limits(checked),
+            aux=[
+                AuxBounds(
+                    name=each.channel.name,
+                    unit=each.channel.unit,
+                    low=each.low if math.isfinite(each.low) else None,
+                    high=each.high if math.isfinite(each.high) else None,
+                )
+                for each in interlock_context(config, info).aux
+            ],
             settings=setting_rows(loaded.document.data),
         )
 

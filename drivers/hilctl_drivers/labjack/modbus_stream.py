@@ -41,7 +41,7 @@ _MARGIN_SCANS = 2
 class StreamSession:
     """One stream of one device: an output played from its buffer, inputs read in each scan.
 
-    The count of scans is the clock. Value number k is output in scan k, and its inputs are read just
+    The count of scans is the clock. Value number k is output in scan k, whose inputs are read just
     before. This holds as long as the output's buffer never runs dry, which each message checks
     before its own values come. Every error is a ``DeviceError``.
 

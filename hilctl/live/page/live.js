@@ -117,7 +117,7 @@ function bytes(count) {
 }
 
 function unit(kind) {
-  return kind === "um" ? "µm" : status.description.command_unit;
+  return { um: "µm", command: status.description.command_unit }[kind] ?? kind;
 }
 
 function showStatus() {
@@ -176,8 +176,10 @@ function showRuns() {
 
 function showFigures() {
   const tiles = $("tiles");
-  if (!tiles.childElementCount) {
-    tiles.replaceChildren(...FIGURES.map(([key, label]) => {
+  const shownFigures = [...FIGURES, ...status.aux.map(({ name, unit: what }) => [name, name, what, 2])];
+  const values = { ...status.figures, ...Object.fromEntries(status.aux.map(({ name, value }) => [name, value])) };
+  if (tiles.childElementCount !== shownFigures.length) {
+    tiles.replaceChildren(...shownFigures.map(([key, label]) => {
       const tile = document.createElement("div");
       const term = document.createElement("dt");
       term.textContent = label;
@@ -187,10 +189,10 @@ function showFigures() {
       return tile;
     }));
   }
-  for (const [key, , what, decimals] of FIGURES) {
+  for (const [key, , what, decimals] of shownFigures) {
     const small = document.createElement("small");
     small.textContent = ` ${what}`;
-    $(`figure-${key}`).replaceChildren(number(status.figures[key], decimals), small);
+    $(`figure-${key}`).replaceChildren(number(values[key], decimals), small);
     $(`figure-${key}`).parentElement.hidden = key.includes("error") && status.description.waveform_unit !== "um";
   }
 }
@@ -351,6 +353,7 @@ function build() {
   if (follows) add("plot-error", [["error", series("error", colour("error"))]], "error, µm");
   add("plot-command", [["command", series("command", colour("command"))],
     ...(measured ? [["measured", series("measured", colour("measured"), dash)]] : [])], `command, ${command}`, "time, s");
+  addAux();
   const chosen = $("level-signal").value || "displacement";
   $("level-signal").replaceChildren(...scopePlots().flatMap(({ signals }) => signals).map((name) => new Option(name, name, false, name === chosen)));
   showKey();
@@ -360,6 +363,23 @@ function build() {
     axes("amplitude, µm", "frequency, Hz"));
   small("plot-late", [{}, series("ticks", colour("bar"), { fill: `${colour("bar")}55`, paths: uPlot.paths.stepped({ align: 1 }) })],
     { x: { time: false, ...log }, y: { range: (_, low, high) => [0, Math.max(1, high * 1.1)] } }, axes("ticks", "late by, µs"));
+}
+
+// One plot per unit.
+function addAux() {
+  const { aux } = status.description;
+  const units = [...new Set(aux.map((each) => each.unit))];
+  $("plots-aux").replaceChildren(...units.map((what) => {
+    const box = document.createElement("div");
+    box.className = "plot";
+    box.id = `plot-aux-${what}`;
+    return box;
+  }));
+  const inks = ["displacement", "command", "error", "reference"];
+  for (const what of units) {
+    const lines = aux.filter((each) => each.unit === what).map(({ name }, at) => [name, series(name, colour(inks[at % inks.length]))]);
+    add(`plot-aux-${what}`, lines, `auxiliary, ${what}`);
+  }
 }
 
 function spectrumRange(_, low, high) {

@@ -35,6 +35,7 @@ class FakeFeed:
             "run": "demo-7", "state": "running", "reason": "", "t_s": 12.34, "total_s": 30.0,
             "inverse": inverse, "gain": 0.7, "offset": -2.0,
             "figures": {"peak_hysteresis_percent": 29.6, "rms_error_percent": None},
+            "aux": [{"name": "coil_c", "unit": "°C", "value": 41.26}],
             "lateness_us": {"p50": 3.0, "p99": 21.0, "max": 40.0}, "late_ticks": 9,
             "gauges": [{"name": "command", "used": 0.84}],
         }  # fmt: skip

@@ -191,7 +191,7 @@ def feed():
     """A run that ends at its fourth poll, with one event per poll."""
     values = np.arange(3.0 * len(SIGNALS)).reshape(len(SIGNALS), 3)
     looked = []
-    made = SimpleNamespace(ended=False, looked=looked, windows=[])
+    made = SimpleNamespace(ended=False, looked=looked, windows=[], signals=SIGNALS)
 
     def poll(now_s):
         looked.append(now_s)
