@@ -54,6 +54,7 @@ _SPREAD_BINS = 200
 _SPECTRUM_POINTS = 800
 _DECADES = 5.0  # of amplitude that a spectrum shows
 _LOW = 0.5
+_INKS = DISPLACEMENT, COMMAND, ERROR, REFERENCE
 _LARGEST_UM = 1e100  # larger readings have no spectrum
 _WIDEST_GAP = 0.02  # share of samples that may be missing
 
@@ -126,6 +127,22 @@ def _draw_command(axes: Axes, recording: Recording) -> None:
     draw_over_time(axes, recording, recording.samples.command, COMMAND, "command")
     axes.set(xlabel="time, s", ylabel=f"command, {recording.command_unit}")
     _mark_judged(axes, recording)
+
+
+def auxiliary(recording: Recording) -> FigureSpec | None:
+    """Return the auxiliary channels over the run, a panel per unit; None without any."""
+    units = dict.fromkeys(each.unit for each in recording.aux_channels)
+    panels = [Panel(partial(_draw_aux, recording=recording, unit=unit), "", _LOW) for unit in units]
+    caption = "Auxiliary channels over the whole run."
+    return FigureSpec("auxiliary", caption, tuple(panels), stacked=True) if units else None
+
+
+def _draw_aux(axes: Axes, recording: Recording, unit: str) -> None:
+    t = recording.samples.index / recording.sample_rate_hz
+    shown = [each.name for each in recording.aux_channels if each.unit == unit]
+    for k, name in enumerate(shown):
+        draw_line(axes, t, recording.aux[name], _INKS[k % len(_INKS)], name)
+    axes.set(xlabel="time, s", ylabel=f"auxiliary, {unit}" if unit else "auxiliary")
 
 
 def steady_cycles(recording: Recording, focus: int = 0) -> FigureSpec | None:

@@ -147,6 +147,7 @@ def run_sheets(recording: Recording, report: RunReport) -> list[FigureSpec]:
         plots.error(recording, focus),
         plots.spectrum(recording, focus),
         plots.time_history(recording),
+        plots.auxiliary(recording),
         plots.lateness(recording),
     )
     return [sheet for sheet in found if sheet is not None]
@@ -159,7 +160,7 @@ def _is_fault(recording: Recording) -> bool:
 def _drawable(recording: Recording) -> bool:
     """Return whether matplotlib can scale axes for all signals; it fails near 1e308."""
     samples = recording.samples
-    signals = (samples.displacement_um, samples.reference_um, samples.command)
+    signals = (samples.displacement_um, samples.reference_um, samples.command, samples.aux)
     return not any(np.any(np.abs(signal) > _LARGEST) for signal in signals)
 
 
@@ -200,6 +201,11 @@ def _rows(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "waveform", f"{segments[0].label}{more}" if segments else ""
     yield "waveform settings", _settings(recording)
     yield "limits", _listed(run.get("limits", ""))
+    for each in recording.aux_channels:
+        values = recording.aux[each.name]
+        ends = (part.reduce(values, initial=np.nan) for part in (np.fmin, np.fmax))
+        text = " to ".join(significant(float(end)) for end in ends)
+        yield each.name, f"{text} {each.unit}" + f" ({each.meaning})" * bool(each.meaning)
     yield "overrides", _listed(run.get(OVERRIDES_FACT, ""))
     yield from _model(recording)
 

@@ -352,7 +352,7 @@ function build() {
   for (const id of ["plot-error", "spectrum"]) $(id).hidden = !follows;
   if (follows) add("plot-error", [["error", series("error", colour("error"))]], "error, µm");
   add("plot-command", [["command", series("command", colour("command"))],
-    ...(measured ? [["measured", series("measured", colour("measured"), dash)]] : [])], `command, ${command}`, "time, s");
+    ...(measured ? [["measured", series("measured", colour("measured"), dash)]] : [])], `command, ${command}`, status.description.aux.length ? "" : "time, s");
   addAux();
   const chosen = $("level-signal").value || "displacement";
   $("level-signal").replaceChildren(...scopePlots().flatMap(({ signals }) => signals).map((name) => new Option(name, name, false, name === chosen)));
@@ -378,7 +378,7 @@ function addAux() {
   const inks = ["displacement", "command", "error", "reference"];
   for (const what of units) {
     const lines = aux.filter((each) => each.unit === what).map(({ name }, at) => [name, series(name, colour(inks[at % inks.length]))]);
-    add(`plot-aux-${what}`, lines, `auxiliary, ${what}`);
+    add(`plot-aux-${what}`, lines, what ? `auxiliary, ${what}` : "auxiliary", what === units.at(-1) ? "time, s" : "");
   }
 }
 
