@@ -227,8 +227,10 @@ def _aux_source(name: str, options: AuxInput, reader: Endpoint, writer: Endpoint
         if (source := holder.profile.inputs.get(options.input)) is not None:
             unit = (source.unit if options.unit is None else options.unit).replace("degC", "°C")
             return AuxSource(AuxChannel(name, unit, options.meaning), holder, source, options)
+    if not holders:
+        raise InputError(f"aux must be omitted: {reader.profile.title} does not support it")
     known = [f"{', '.join(each.profile.inputs)} of {each.profile.title}" for each in holders]
-    has = " or ".join(dict.fromkeys(known)) or "no device here supports auxiliary channels"
+    has = " or ".join(dict.fromkeys(known))
     raise InputError(f"aux.{name}.input must be an input: {has}, got {options.input!r}")
 
 

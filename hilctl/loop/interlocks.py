@@ -262,7 +262,7 @@ class Interlocks:
 
     def _aux_trip(self, sample: int, limit: AuxLimit, value: float) -> Trip:
         name = limit.channel.name
-        text = f"{name} {value:.4g} {limit.channel.unit} at sample {sample} must be {limit}"
+        text = f"{name} {value:.6g} {limit.channel.unit} at sample {sample} must be {limit}"
         if math.isnan(value):
             since = _since(self.settings.sensor_invalid_s)
             text = f"{name} at sample {sample} is no valid reading{since}"
