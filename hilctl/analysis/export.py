@@ -177,8 +177,9 @@ def export_all(
     """Write each finished recording to ``output/name=NAME/date=DATE/FILE-RUN.parquet``.
 
     The files form one Hive-style data set with the same columns in all files. A column that a run
-    does not have is null, and so is NaN, which databases order above all numbers. Files are written
-    atomically and never replaced; another call continues an interrupted export.
+    does not have is null, and so is NaN, which databases order above all numbers. Auxiliary
+    channels, which differ from run to run, are omitted. Files are written atomically and never
+    replaced; another call continues an interrupted export.
 
     Args:
         folder: Folder with recordings, at any depth.

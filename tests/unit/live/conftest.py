@@ -33,7 +33,8 @@ def active_run(description, place, slots=16):
 def begun(folder, description, slots=16):
     """Return the ring of a run whose loop is active."""
     description.write(folder.description)
-    ring = SampleRing.create(folder.ring, slots=slots, block=BLOCK, state_size=1)
+    aux = len(description.aux)
+    ring = SampleRing.create(folder.ring, slots=slots, block=BLOCK, state_size=1, aux=aux)
     ring.page.put(PageField.PHASE, Phase.RUNNING)
     return ring
 
@@ -53,6 +54,7 @@ def exchange(ring, blocks, spike_um=0.0, keep=None):
         block.command[:] = block.wanted[:] = index / 10.0
         ring.sending(block)
         block.displacement_um[:] = index
+        block.aux[:] = number
         if number == blocks[-1]:
             block.displacement_um[7] += spike_um
         ring.answered(block)

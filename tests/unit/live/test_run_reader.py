@@ -13,10 +13,20 @@ from hilctl.base.segments import Segment
 from hilctl.live.run_reader import RunList, RunReader, frame_of, frames_of, nearest_window_s
 from hilctl.live.scope import ROW, SIGNALS, Buckets, Scope, ScopeWindow
 from hilctl.loop.safe_output import LoopOutcome
+from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared.shared_page import PageField, Stop
+from hilctl.run.start import checked_experiment
 from tests.fakes import SteppingClock
-from tests.unit.live.conftest import BLOCK, active_run, begun, exchange, first, traces
+from tests.unit.live.conftest import (
+    BLOCK,
+    CONFIGS,
+    active_run,
+    begun,
+    exchange,
+    first,
+    traces,
+)
 
 
 @pytest.fixture
@@ -25,6 +35,21 @@ def run(description, tmp_path):
     with active_run(description, tmp_path, 128) as (folder, ring):
         ring.page.put(PageField.WAVEFORM_AT, 100)
         yield RunReader(folder), ring
+
+
+def test_auxiliary_channels(tmp_path):
+    settings = ["device.temperatures={}", "limits.aux={coil_c: 18, rod_c: [4, 14]}"]
+    description = RunDescription.of(checked_experiment(CONFIGS / "demo.yaml", settings))
+    with active_run(description, tmp_path, 16) as (folder, ring):
+        feed = RunReader(folder)
+        exchange(ring, range(10))
+        feed.poll(1.0)
+        status, frame = feed.status(), next(frames_of(feed, 1.0, 0.02, lambda: 0.0, print))
+    found = [(each["name"], each["unit"], each["value"]) for each in status["aux"]]
+    assert found == [("coil_c", "°C", 9.0), ("rod_c", "°C", 9.0)]
+    used = {each["name"]: each["used"] for each in status["gauges"]}
+    assert (used["coil_c"], used["rod_c"]) == pytest.approx((0.5, 1.8))
+    assert np.nanmax(frame.high["coil_c"]) == 9.0
 
 
 def test_samples_are_read_without_consuming_them(run):
