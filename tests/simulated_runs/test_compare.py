@@ -10,7 +10,8 @@ from hilctl.analysis.report import summarize
 from hilctl.comparison.simulated_trials import TrialDevice
 from hilctl.experiment.load import load_experiment
 from hilctl.recording.reader import read
-from hilctl.run.start import start_run
+from hilctl.run.start import checked_experiment
+from hilctl.run.unpaced import run_unpaced
 from tests.commands import hilctl
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -25,7 +26,7 @@ def folder(tmp_path_factory):
 def models(folder):
     """Every model of the catalogue on the loops of chapter 4, by name, as the command prints it."""
     loops, page = folder / "loops.mcap", folder / "models.html"
-    run = start_run(CONFIGS / "identify_omega_chapter4.yaml", [], loops, False, lambda _: None)
+    run = run_unpaced(checked_experiment(CONFIGS / "identify_omega_chapter4.yaml", []), loops)
     assert run.code == "completed"
     ended = hilctl("compare", loops, "--html", page, "--save", folder, "--json")
     return {model["name"]: model for model in json.loads(ended.stdout)["models"]}
@@ -78,7 +79,7 @@ def test_a_saved_model_runs_like_any_other(models, folder, name):
     path = folder / f"{name}.mcap"
     settings = [f"compensator.model={folder / name}.yaml", "waveform.frequency_hz=100",
                 "waveform.duration_s=0.5"]  # fmt: skip
-    run = start_run(CONFIGS / "terfenol_sine_6a.yaml", settings, path, False, lambda _: None)
+    run = run_unpaced(checked_experiment(CONFIGS / "terfenol_sine_6a.yaml", settings), path)
     assert run.code == "completed"
     recording = read(path)
     assert replay(recording).identical

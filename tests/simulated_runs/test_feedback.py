@@ -1,4 +1,4 @@
-"""Feedback around the compensator on the simulated rig, sample by sample through real runs."""
+"""Feedback around the compensator on the simulated rig, sample by sample through complete runs."""
 
 import json
 from pathlib import Path
@@ -11,7 +11,7 @@ from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.base.samples import Flag
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment, start_run
+from hilctl.run.start import checked_experiment
 from hilctl.run.unpaced import run_unpaced
 
 CONFIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
@@ -31,20 +31,7 @@ def run(tmp_path):
 
     def run(*settings):
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
-        result = start_run(CONFIG, [*BASE, *settings], path, False, lambda progress: None)
-        return result, read(path)
-
-    return run
-
-
-@pytest.fixture
-def run_blocks(tmp_path):
-    """Run the shipped experiment in blocks of 50 at 50 kHz, as fast as it goes."""
-
-    def run(*settings):
-        path = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
-        run_unpaced(checked_experiment(CONFIG, [STAGED, *settings]), path)
-        return read(path)
+        return run_unpaced(checked_experiment(CONFIG, [*BASE, *settings]), path), read(path)
 
     return run
 
@@ -67,10 +54,11 @@ def test_what_the_model_does_not_know_is_taken_out(run, model, wrong):
     assert replay(recording).identical
 
 
-def test_an_integrator_takes_out_the_offset_of_small_loops(run_blocks):
+def test_an_integrator_takes_out_the_offset_of_small_loops(run):
+    blocks = (STAGED, "sample_rate_hz=50000", "block=50", "waveform.frequency_hz=10.0")
     quarter = ("waveform.amplitude=10.2", "waveform.offset=0.0", "waveform.duration_s=2.0")
-    plain = run_blocks(*quarter, DRIFT)
-    recording = run_blocks(*quarter, DRIFT, INTEGRAL)
+    _, plain = run(*blocks, *quarter, DRIFT)
+    _, recording = run(*blocks, *quarter, DRIFT, INTEGRAL)
     (before,), (after,) = summarize(plain).segments, summarize(recording).segments
     assert before.peak_error_percent > 20.0
     assert after.peak_error_percent < 1.5
