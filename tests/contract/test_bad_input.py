@@ -1,6 +1,7 @@
 """Invalid input on the command line: one message, exit code 2, no files left."""
 
 import json
+import os
 import subprocess
 import sys
 from typing import NamedTuple
@@ -216,6 +217,13 @@ def test_unwritable_recording(refused, output, message, overwrite):
 
 
 @pytest.mark.usefixtures("outputs")
+@pytest.mark.parametrize("name", ["/dev/null", "/dev/full", "/proc/x.mcap", "fifo", ".", "no/x"])
+def test_output_that_is_no_file(refused, place, name):
+    os.mkfifo(place / "fifo")
+    refused(name, "run", "x.yaml", "--output", name, "--overwrite")
+
+
+@pytest.mark.usefixtures("outputs")
 @pytest.mark.parametrize(("words", "message"), [
     ((), "run.mcap: exists already: give another --output, or --overwrite"),
     (("--overwrite", "--set", "block=0"), "--set block=0: block: must be >= 1, got 0"),
@@ -259,26 +267,12 @@ def test_unknown_option(hilctl, place):
 
 
 @pytest.mark.slow
-@pytest.mark.parametrize(
-    ("text", "words", "message"),
-    [
-        (GOOD.replace("60.0]}", "60.0}"), (), "x.yaml:7: is not readable YAML"),
-        (
-            GOOD.replace("amplitude: 1.0", "amplitude: .nan"), ("--json",),
-            "x.yaml:5: waveform.amplitude: must be a finite number, got nan",
-        ),
-        (
-            GOOD, ("--output", "x.yaml/run.mcap"),
-            "x.yaml/run.mcap: can't be written: Not a directory",
-        ),
-    ],
-    ids=["malformed", "not a number, for programs", "unwritable"],
-)  # fmt: skip
-def test_process(tmp_path, text, words, message):
-    (tmp_path / "x.yaml").write_text(text)
+def test_process(tmp_path):
+    (tmp_path / "x.yaml").write_text(GOOD.replace("amplitude: 1.0", "amplitude: .nan"))
     before = contents(tmp_path)
-    command = [sys.executable, "-m", "hilctl", "run", "x.yaml", *words]
+    command = [sys.executable, "-m", "hilctl", "run", "x.yaml", "--json"]
     ended = subprocess.run(command, cwd=tmp_path, capture_output=True, text=True, timeout=240.0)
+    message = "x.yaml:5: waveform.amplitude: must be a finite number, got nan"
     check_refused(Ended(ended.returncode, ended.stdout, ended.stderr), message)
-    assert bool(ended.stdout) == ("--json" in words)
+    assert ended.stdout
     assert contents(tmp_path) == before

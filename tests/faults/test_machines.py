@@ -42,32 +42,16 @@ def hilctl(tmp_path):
 
 
 @pytest.mark.parametrize(("shell", "environment"), [
-    ('ulimit -n 32; "$@"', {}),
-    ('umask 077; "$@"', {}),
-    ('umask 0; "$@"', {}),
-    ('unset HOME TERM; "$@"', {}),
-    ('"$@" | head -c 1', {}),
+    ('ulimit -n 32; umask 077; unset HOME TERM; "$@"', {}),
+    ('umask 0; "$@" | head -c 1', {}),
     ('"$@" >&- 2>&- <&-', {}),
     ('"$@"', {"COLUMNS": "1", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}),
-], ids=["32 files", "umask 077", "umask 0", "no home", "head", "closed", "no locale"])  # fmt: skip
+], ids=["private", "head", "closed", "no locale"])  # fmt: skip
 def test_runs_with_little(hilctl, tmp_path, shell, environment):
-    """A run completes with few file descriptors, no terminal and no reader."""
+    """A run completes with few file descriptors, no home, no terminal and no reader."""
     ended = hilctl(shell, **environment)
     assert ended.returncode == 0, ended.stderr
     assert (tmp_path / "run.mcap").stat().st_size > 1000
-
-
-@pytest.mark.parametrize("name", ["/dev/null", "/dev/full", "/proc/x.mcap", "fifo", ".", "no/x"])
-def test_output_that_is_no_file_is_refused(hilctl, tmp_path, name):
-    """An output that is no file is rejected with one message and no new file."""
-    os.mkfifo(tmp_path / "fifo")
-    (tmp_path / "e.yaml").touch()  # the experiment of the command
-    before = sorted(tmp_path.iterdir())
-    ended = hilctl(output=name)
-    assert ended.returncode == 2, ended.stderr
-    assert len(ended.stderr.splitlines()) == 1
-    assert name in ended.stderr
-    assert sorted(tmp_path.iterdir()) == before
 
 
 @pytest.mark.parametrize("shell", ['ulimit -n 9; "$@"', 'ulimit -v 300000; "$@"'])
