@@ -60,7 +60,7 @@ def command(options=""):
     return f"{sys.executable} -m hilctl run run.yaml --output run.mcap {options}\n"
 
 
-@pytest.mark.parametrize("option", ["", "--watch"])
+@pytest.mark.parametrize("option", [pytest.param("", marks=pytest.mark.long), "--watch"])
 def test_ctrl_z_neither_suspends_a_run_nor_hides_how_to_end_it(shell, tmp_path, option):
     """The supervisor still sees requests, and makes changes."""
     shell.type(command(option))
@@ -73,7 +73,7 @@ def test_ctrl_z_neither_suspends_a_run_nor_hides_how_to_end_it(shell, tmp_path, 
     assert read(tmp_path / "run.mcap").end["code"] == "stopped"
 
 
-@pytest.mark.parametrize("option", ["&", "--watch &"])
+@pytest.mark.parametrize("option", [pytest.param("&", marks=pytest.mark.long), "--watch &"])
 def test_a_run_in_the_background_of_the_shell_does_not_freeze(shell, tmp_path, option):
     """Nor does it take the terminal from the shell, which still answers."""
     shell.type(command(option))

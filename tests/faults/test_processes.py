@@ -78,12 +78,11 @@ def test_loop_that_hangs_is_killed_and_the_device_made_safe(tmp_path):
     assert replay(recording).identical
 
 
-@pytest.mark.parametrize("stopped_s", [0.01, 0.4])
-def test_short_stop_of_the_loop_costs_no_sample(tmp_path, stopped_s):
+def test_short_stop_of_the_loop_costs_no_sample(tmp_path):
     """Below the limit the run goes on; a device with a clock of its own is caught up with."""
     run = begun(tmp_path)
     os.kill(run.loop, signal.SIGSTOP)
-    time.sleep(stopped_s)
+    time.sleep(0.4)
     os.kill(run.loop, signal.SIGCONT)
     time.sleep(0.5)
     run.process.send_signal(signal.SIGINT)
@@ -92,7 +91,7 @@ def test_short_stop_of_the_loop_costs_no_sample(tmp_path, stopped_s):
     recording = read(run.output)
     assert contiguous(recording)
     assert recording.dropped == 0
-    assert int(recording.end["worst_late_ns"]) >= 0.9e9 * stopped_s
+    assert int(recording.end["worst_late_ns"]) >= 0.9e9 * 0.4
     assert replay(recording).identical
 
 

@@ -307,9 +307,11 @@ def refusal(text: str, folder: Path) -> InputError | None:
     return None
 
 
-@pytest.mark.parametrize(
-    "part", [0, *(pytest.param(part, marks=pytest.mark.slow) for part in range(1, PARTS))]
-)
+@pytest.mark.parametrize("part", [
+    0,
+    *(pytest.param(part, marks=pytest.mark.slow) for part in range(1, 8)),
+    *(pytest.param(part, marks=[pytest.mark.slow, pytest.mark.long]) for part in range(8, PARTS)),
+])  # fmt: skip
 def test_damaged_experiments_are_refused_in_words(tmp_path, part):
     (tmp_path / "model.yaml").write_text(MODEL_TEXT, encoding="utf-8")
     chance = random.Random(part)
