@@ -17,28 +17,21 @@ ROOT = Path(__file__).parents[2]
 TRAPS = ("signal", "json", "numpy", "yaml", "struct", "hilctl", "hilctl_drivers", "mmap", "queue")
 
 
-def run(folder, tmp_path):
+def run(folder):
     program = Path(sys.executable).parent / "hilctl"
     command = [program, "run", ROOT / "configs" / "demo.yaml", "--json", "--overwrite"]
-    command += ["--output", tmp_path / "run.mcap", "--set", "waveform.duration_s=0.5"]
+    command += ["--output", folder / "run.mcap", "--set", "waveform.duration_s=0.5"]
     return ended(command, cwd=folder)
 
 
-@pytest.mark.parametrize("name", ["-a: lab #3 [x] 50 % {y}\n\"ü'"])
-def test_folder_of_any_name(tmp_path, name):
-    """A run starts and records in a folder of any name."""
-    folder = tmp_path / name
+def test_folder_of_any_name_and_content(tmp_path):
+    """A run starts and records there; no process imports local files with names of modules."""
+    folder, sprung = tmp_path / "-a: lab #3 [x] 50 % {y}\n\"ü'", tmp_path / "sprung"
     folder.mkdir()
-    assert json.loads(run(folder, folder).stdout)["code"] == "completed"
-
-
-def test_modules_of_the_lab_are_never_imported(tmp_path):
-    """Local files with names of modules are not imported by any process."""
-    sprung = tmp_path / "sprung"
     for name in TRAPS:
         text = f"open({str(sprung)!r}, 'a').write({name!r} + chr(10)); raise SystemExit({name!r})"
-        (tmp_path / f"{name}.py").write_text(text)
-    run(tmp_path, tmp_path)
+        (folder / f"{name}.py").write_text(text)
+    assert json.loads(run(folder).stdout)["code"] == "completed"
     assert not sprung.exists(), sprung.read_text()
 
 

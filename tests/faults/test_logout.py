@@ -4,7 +4,6 @@ import os
 import shutil
 import signal
 import subprocess
-import sys
 import time
 
 import pytest
@@ -12,6 +11,7 @@ import pytest
 from hilctl.recording.reader import read
 from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import base_folder, runs
+from tests.commands import typed
 from tests.faults.test_daemon import await_state, hilctl, start, stop_all
 
 
@@ -27,6 +27,11 @@ def logged_out(tmp_path):
 def test_it_is_still_found_changed_watched_and_stopped(logged_out):
     """All commands work, and the recording is complete."""
     assert await_state("running")["recording"] == str(logged_out)
+    pipe = subprocess.PIPE
+    with subprocess.Popen(typed("watch"), stdout=pipe, stderr=pipe, text=True) as watching:
+        assert watching.stdout.readline()
+        watching.terminate()
+        assert "Traceback" not in watching.communicate(timeout=60)[1]
     assert hilctl("set", "gain=0.5", "--over", "0.1")["gain"] == 0.5
     hilctl("mark", "logged in again")
     (ended,) = hilctl("stop", "--all")["runs"]
@@ -55,15 +60,3 @@ def test_a_supervisor_that_crashes_afterwards_loses_no_sample(logged_out):
     assert recording.dropped == 0
     assert abs(recording.samples.command[-1]) < 0.01  # the complete ramp is recorded
     assert runs() == []
-
-
-def test_it_can_be_watched(logged_out):
-    await_state("running")
-    command = [sys.executable, "-m", "hilctl", "watch"]
-    with subprocess.Popen(
-        command, stdin=subprocess.DEVNULL, stdout=subprocess.PIPE, stderr=subprocess.PIPE, text=True
-    ) as watching:
-        assert watching.stdout.readline()
-        watching.terminate()
-        _, err = watching.communicate(timeout=60)
-    assert "Traceback" not in err

@@ -8,7 +8,7 @@ import pytest
 from tests.commands import hilctl
 from tests.faults.conftest import MODULE
 
-AWAY_S = 7.0
+AWAY_S = 2.0
 PULLED_AT = 80
 
 
