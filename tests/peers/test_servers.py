@@ -241,8 +241,9 @@ def test_finds_out_whether_a_sample_is_one_transaction(served):
     """Function 23 is used if the server supports it, otherwise a write and a read."""
     device = served.device()
     device.open(RATE_HZ, 1)
+    found = device.one_transaction
     device.close()
-    assert device.one_transaction == served.server.writes_and_reads
+    assert found == served.server.writes_and_reads
 
 
 def test_opening_does_not_move_the_output(served):
