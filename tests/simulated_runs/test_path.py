@@ -12,11 +12,11 @@ STAGE = f"device.stage={PiezoStage.fitted(-100.0, 100.0, 38.0).model_dump_json()
 QUICK = ("sample_rate_hz=1000", "block=10")
 
 RIGS = {
-    "current, both signs": ("simulated_terfenol", (), 1.2),
     "voltage, one sign": ("simulated_piezo", (), 0.24),
 }
 """Device, settings of ``init``, and 1.5 times the validation error with limits set by hand."""
 MORE_RIGS = {
+    "current, both signs": ("simulated_terfenol", (), 1.2),
     "current, one sign": ("simulated_terfenol", ("limits.drive_a=[0.0, 6.0]",), 1.2),
     "voltage, both signs": ("simulated_piezo", (STAGE,), 0.24),
     "domains": ("simulated_terfenol", ("device.physics=domains",), 1.2),
