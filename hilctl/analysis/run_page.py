@@ -1,9 +1,10 @@
 """Page of a run: result, figures, tables, provenance and events."""
 
 import json
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 
@@ -235,8 +236,16 @@ def _listed(text: str) -> str:
     except ValueError:
         return text
     if isinstance(found, dict):
-        found = [f"{key} {value}" for key, value in found.items()]
+        found = list(_members(found))
     return ", ".join(map(str, found)) if isinstance(found, list) else text
+
+
+def _members(found: Mapping[str, Any], above: str = "") -> Iterator[str]:
+    for key, value in found.items():
+        if isinstance(value, dict):
+            yield from _members(value, f"{above}{key}.")
+        else:
+            yield f"{above}{key} {value}"
 
 
 def _model(recording: Recording) -> Iterator[tuple[str, str]]:
