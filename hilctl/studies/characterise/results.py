@@ -205,12 +205,16 @@ def _history(recording: Recording) -> History:
     """Return a recording up to the end of its last waveform, with gaps filled.
 
     Until the first waveform has been at both of its ends, the displacement depends on what the
-    actuator did before, so that part is not evaluated.
+    actuator did before, so that part is not evaluated. A simulated actuator begins at rest: the
+    whole history of a drive of one sign, which never erases that state, is evaluated.
     """
     stop = recording.segments[-1].steady_stop
     command, displacement_um = without_gaps(recording, 0, stop)
     begin = command[: recording.segments[0].stop]
-    erased = max(int(begin.argmin()), int(begin.argmax()))
+    lowest, highest = int(begin.argmin()), int(begin.argmax())
+    one_sign = not begin[lowest] < begin[0] < begin[highest]
+    at_rest = one_sign and recording.run.get("simulated") == "true"
+    erased = 0 if at_rest else max(lowest, highest)
     held = np.setdiff1d(np.arange(stop), recording.samples.index)
     label, rate_hz = recording.path.name, recording.sample_rate_hz
     return History(label, command, displacement_um, rate_hz, erased, held)
