@@ -31,6 +31,7 @@ ASSUMED_PHASE_MARGIN_DEG = 60.0
 _POINTS = 4096
 _LOWEST = 1e-6  # of the sample rate, and of the lowest measured frequency
 _ROUNDING = 1e-6
+_WHOLE = 0.44  # of the sample rate: a response up to there may end before a resonance
 
 
 class Exchange(NamedTuple):
@@ -129,7 +130,8 @@ class MeasuredResponse(StrictModel):
         """Return the open loop with a controller.
 
         Raises:
-            InputError: The frequencies end before its lag reaches 180 degrees, or another rate.
+            InputError: The frequencies end before its lag reaches 180 degrees or before a
+                resonance, or the rate is another one.
         """
         if not math.isclose(exchange.rate_hz, self.sample_rate_hz, rel_tol=1e-6):
             was, now = self.sample_rate_hz, exchange.rate_hz
@@ -142,6 +144,10 @@ class MeasuredResponse(StrictModel):
             lag_deg = math.degrees(loop.lag[-1])
             text = f"ends at {known[-1]:g} Hz, where the open loop lags by {lag_deg:.3g} degrees"
             raise InputError(f"{text}: measure up to the lag of 180 degrees")
+        before = float(np.interp(0.9 * known[-1], hz, loop.size))
+        if loop.size[-1] > before and known[-1] < _WHOLE * exchange.rate_hz:
+            text = f"ends at {known[-1]:g} Hz, where the gain of the open loop rises"
+            raise InputError(f"{text}: measure beyond the resonance")
         return loop
 
     def check_model(self, model: HysteresisModel | None) -> None:

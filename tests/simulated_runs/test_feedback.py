@@ -66,7 +66,7 @@ def test_an_integrator_takes_out_the_offset_of_small_loops(run):
 
 
 SMALL = (
-    "waveform={kind: multisine, unit: um, amplitude: 0.7, first_hz: 5.0, last_hz: 2200.0,"
+    "waveform={kind: multisine, unit: um, amplitude: 0.7, first_hz: 5.0, last_hz: 2400.0,"
     " step_hz: 20.0, duration_s: 3.0, soft_start_s: 0.2, soft_end_s: 0.2}"
 )
 

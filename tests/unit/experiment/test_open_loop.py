@@ -73,6 +73,14 @@ def test_a_loop_of_the_opposite_sign_has_no_margin():
     assert phase_deg < 0.0
 
 
+def test_a_response_that_ends_below_the_resonance_is_refused():
+    facts = {"sample_rate_hz": RATE_HZ, "model_sha256": "", "phase_deg": (0.0, -170.0, -180.0)}
+    ends = 0.4 * RATE_HZ
+    rising = MeasuredResponse(gain=(1.0, 1.0, 3.0), frequency_hz=(1.0, 0.9 * ends, ends), **facts)
+    with pytest.raises(InputError, match="resonance"):
+        rising.open_loop(Gains(0.0, 1.0), SINGLE)
+
+
 def test_a_response_file_is_read_as_it_was_written(tmp_path):
     facts = {"sample_rate_hz": RATE_HZ, "model_sha256": "a1", "frequency_hz": (1.0, 3.0)}
     response = MeasuredResponse(gain=(0.1, 1.0 / 3.0), phase_deg=(-0.1, -200.0), **facts)
