@@ -47,6 +47,7 @@ h2 { font-size: 1.2rem; margin: 1.8rem 0 .5rem; border-bottom: 1px solid var(--l
 .side section { break-inside: avoid; margin-bottom: 1.8rem; }
 .side h2 { margin-top: 0; }
 .figures { columns: 21.4rem; column-gap: 1.5rem; margin-top: 1rem; }
+.side .figures { columns: auto; }
 figure { margin: 0 0 1.2rem; break-inside: avoid; }
 figure svg { display: block; width: 100%; height: auto; max-width: 32rem; }
 figcaption { color: var(--quiet); font-size: .9rem; max-width: 32rem; }

@@ -189,7 +189,7 @@ def open_loop_sheet(design: FeedbackDesign) -> FigureSpec:
     lowest_hz = min(design.response.frequency_hz[0], 0.1 * design.proposed.crossover_hz)
     shown = hz >= lowest_hz
     crossing_hz = design.proposed.crossover_hz
-    late_hz = float(hz[np.argmax(design.loop.lag >= np.pi)])
+    late_hz = float(hz[np.argmax(np.where(design.loop.lag >= np.pi, design.loop.size, 0.0))])
 
     def draw(axes: Axes, part: str) -> None:
         values, line, at_hz = (size_db, 0.0, late_hz)
@@ -214,12 +214,12 @@ def open_loop_sheet(design: FeedbackDesign) -> FigureSpec:
 
 def write_design(design: FeedbackDesign, path: Path) -> None:
     """Write the page of a design; an existing file is replaced."""
+    (_, *headings), loops = figure_rows(design)
+    tables = [(name, zip(headings, figures, strict=True)) for name, *figures in loops]
+    section = html.details("Proposed section of the experiment", design.to_yaml())
     body = [
         "<h1>Feedback</h1>",
         html.paragraph(str(design.path), "file"),
-        html.figures([open_loop_sheet(design)]),
-        "<h2>Margins</h2>",
-        html.grid(*figure_rows(design)),
-        html.details("Proposed section of the experiment", design.to_yaml()),
+        *html.results([open_loop_sheet(design)], "Margins", tables, [section]),
     ]
     html.write_page(html.document("Feedback", body), path)
