@@ -90,13 +90,11 @@ ProfileName: TypeAlias = Annotated[
 def parse_profile(text: str, where: str) -> BaseProfile:
     """Return the profile in a YAML text named ``where``; raise ConfigError with all problems."""
     document = Document(where, text)
-    link = document.data.get("link")
-    kind = link.get("kind") if isinstance(link, dict) else None
+    kind = document.value(("link", "kind"))
     if not isinstance(kind, str) or kind not in LINK_KINDS:
         rule = f"must be one of {', '.join(LINK_KINDS)}"
         value = "nothing" if kind is None else repr(kind)
-        place = document.where(("link", "kind"))
-        raise ConfigError([ConfigProblem(place, "link.kind", rule, value)])
+        raise ConfigError([document.problem("link.kind", rule, value)])
     profile = document.validate(profile_class(kind))
     problems = [
         ConfigProblem(
@@ -108,10 +106,7 @@ def parse_profile(text: str, where: str) -> BaseProfile:
         for index, key in enumerate(profile.unverified)
         if not document.holds(loc_of(key))
     ]
-    problems += [
-        ConfigProblem(document.where(loc_of(key)), key, rule, value)
-        for key, rule, value in profile.misfits()
-    ]
+    problems += [document.problem(key, rule, value) for key, rule, value in profile.misfits()]
     if problems:
         raise ConfigError(problems)
     return profile

@@ -511,10 +511,21 @@ class Document:
         """Return whether a location has a value."""
         return loc in self._places
 
+    def value(self, loc: Loc) -> Any:
+        """Return the value at a location; None without one."""
+        found: Any = self.data if self.holds(loc) else None
+        for part in loc if self.holds(loc) else ():
+            found = found[part]
+        return found
+
     def where(self, loc: Loc) -> str:
         """Return ``file:line`` of a value, or of its nearest parent."""
         ends = range(len(loc), -1, -1)
         return next((self._places[loc[:end]] for end in ends if self.holds(loc[:end])), self.name)
+
+    def problem(self, key: str, rule: str, value: str = "", hint: str = "") -> ConfigProblem:
+        """Return a broken rule with the place of its dotted key."""
+        return ConfigProblem(self.where(loc_of(key)), key, rule, value, hint)
 
     def validate(
         self,
@@ -531,9 +542,7 @@ class Document:
         Raises:
             ConfigError: One or more rules are broken; all are listed.
         """
-        data: Any = self.data
-        for part in at:
-            data = data[part]
+        data = self.value(at)
         if without:
             data = {key: value for key, value in data.items() if key not in without}
         try:

@@ -14,7 +14,7 @@ from hilctl.api.runs import default_path, is_set, refuse_existing
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.files import read_text, write_text
 from hilctl.base.types import CommandUnit
-from hilctl.base.yaml import Document
+from hilctl.base.yaml import Document, dump
 from hilctl.cli.console import listing, print_rich
 from hilctl.cli.options import AsJson, Settings, device_names, example_names, profile_names
 from hilctl.cli.output import print_json, print_result
@@ -238,10 +238,11 @@ def _answers(
     if unit is None and "amplifier" in begun(reader).section:
         unit = cast(CommandUnit, _asked_one_of("current or voltage of the actuator", ("A", "V")))
     device = begun(reader)
-    _ask(device, path, device.asked, {"device": device.section}, chosen)
-    drafted = Document(str(path), starting_experiment(device, path, chosen)[0]).data
+    section = Document(str(path), dump({"device": dict(device.section)}))
+    _ask(device, path, device.asked, section, chosen)
+    drafted = Document(str(path), starting_experiment(device, path, chosen)[0])
     limits = {f"limits.{key}": text for key, text in LIMITS_ASKED.items()
-              if key in drafted["limits"]}  # fmt: skip
+              if drafted.holds(("limits", key))}  # fmt: skip
     _ask(device, path, limits, drafted, chosen)
     return unit, reader
 
@@ -250,7 +251,7 @@ def _ask(
     device: TemplateDevice,
     path: Path,
     questions: Mapping[str, str],
-    defaults: Mapping[str, object],
+    defaults: Document,
     chosen: list[str],
 ) -> None:
     """Ask for values by dotted key; the complete experiment is checked after each answer."""
@@ -262,9 +263,7 @@ def _ask(
             _ask_again_unless(lambda: starting_experiment(device, path, settings), keys[number:])
             return settings[-1]
 
-        default: object = defaults
-        for part in key.split("."):
-            default = default.get(part) if isinstance(default, Mapping) else None
+        default = defaults.value(tuple(key.split(".")))
         default = list(default) if isinstance(default, tuple) else default
         text = None if default is None else str(default)
         chosen.append(typer.prompt(questions[key], default=text, value_proc=checked))

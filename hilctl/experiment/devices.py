@@ -17,7 +17,7 @@ from pkgutil import resolve_name
 from typing import Any, NamedTuple
 
 from hilctl.base.device import Device, VoltageLimit, complete
-from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
 from hilctl.base.yaml import Document, load_document
@@ -70,15 +70,14 @@ def made_device(document: Document, folder: Path, files: TextFiles) -> Device | 
     if not isinstance(given, dict):
         return None
     kind = given.get("kind")
-    where = document.where(("device", "kind"))
     if not isinstance(kind, str):
         rule, value = ("must be text", repr(kind)) if "kind" in given else ("is required", "")
         hint = f"known: {', '.join(sorted(known_devices()))}"
-        raise ConfigError([ConfigProblem(where, "device.kind", rule, value, hint)])
+        raise ConfigError([document.problem("device.kind", rule, value, hint)])
     try:
         chosen = device_class(kind)
     except InputError as error:
-        raise ConfigError([ConfigProblem(where, "device.kind", str(error))]) from None
+        raise ConfigError([document.problem("device.kind", str(error))]) from None
     context: dict[str, object] = {"folder": folder, "files": files}
     if "amplifier" in document.data:
         with suppress(ConfigError):  # an invalid one is reported as a key of the experiment
@@ -89,8 +88,7 @@ def made_device(document: Document, folder: Path, files: TextFiles) -> Device | 
     except ConfigError:
         raise
     except InputError as error:
-        place = document.where(("device",))
-        raise ConfigError([ConfigProblem(place, "device", str(error))]) from None
+        raise ConfigError([document.problem("device", str(error))]) from None
 
 
 def shipped_profiles() -> dict[str, str]:

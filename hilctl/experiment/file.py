@@ -12,6 +12,7 @@ from hilctl.base.strict import (
     BeforeValidator,
     Field,
     StrictModel,
+    StringConstraints,
     WithJsonSchema,
     model_validator,
 )
@@ -21,7 +22,7 @@ from hilctl.loop.interlocks import InterlockSettings
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import USUAL_MISSED_SHARE
 from hilctl.machine.rt_setup import Realtime
-from hilctl.recording.metadata_keys import RECORDINGS, LabelValue
+from hilctl.recording.metadata_keys import RECORDINGS
 from hilctl.waveforms.spec import AnyWaveform
 
 _NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
@@ -300,15 +301,6 @@ _KEY = "[A-Za-z][A-Za-z0-9_]{0,39}"
 _NUMBER = re.compile(r"-?(?:0|[1-9]\d*)(?:\.\d+)?(?:[eE][+-]?\d+)?")  # as in JSON
 
 
-def _value(value: Any) -> Any:
-    if isinstance(value, bool) or not isinstance(value, str | int | float):
-        rule = "must be text or a number"
-        raise ValueError(f"{rule}: {value!r}")  # noqa: TRY004  pydantic wants this one
-    if isinstance(value, str) and len(value) > LONGEST_TEXT:
-        raise ValueError(f"must have at most {LONGEST_TEXT} characters: it has {len(value)}")
-    return value
-
-
 def _key(key: str) -> str:
     if not re.fullmatch(_KEY, key):
         rule = "a key must be at most 40 letters, digits and '_', and begin with a letter"
@@ -316,27 +308,12 @@ def _key(key: str) -> str:
     return key
 
 
-def _not_too_many(labels: dict[str, Any]) -> dict[str, Any]:
-    if len(labels) > MOST_LABELS:
-        raise ValueError(f"must be at most {MOST_LABELS}: there are {len(labels)}")
-    return labels
-
-
 Labels: TypeAlias = Annotated[
     dict[
         Annotated[str, AfterValidator(_key)],
-        Annotated[
-            LabelValue,
-            BeforeValidator(_value),
-            WithJsonSchema(
-                {"anyOf": [{"type": "string", "maxLength": LONGEST_TEXT}, {"type": "number"}]}
-            ),
-        ],
+        Annotated[str, StringConstraints(max_length=LONGEST_TEXT)] | int | float,
     ],
-    AfterValidator(_not_too_many),
-    Field(
-        json_schema_extra={"maxProperties": MOST_LABELS, "propertyNames": {"pattern": f"^{_KEY}$"}}
-    ),
+    Field(max_length=MOST_LABELS, json_schema_extra={"propertyNames": {"pattern": f"^{_KEY}$"}}),
 ]
 
 

@@ -2,7 +2,7 @@
 
 import json
 import os
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
@@ -11,7 +11,7 @@ from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import shown_briefly
-from hilctl.base.yaml import Document, dump, load_document
+from hilctl.base.yaml import Document, dump, load_document, loc_of
 from hilctl.experiment.correction import Correction, load_correction
 from hilctl.experiment.devices import made_device
 from hilctl.experiment.file import Experiment
@@ -53,7 +53,7 @@ class LoadedExperiment:
 
     def problem(self, key: str, rule: str, value: str = "", hint: str = "") -> ConfigProblem:
         """Return a broken rule with the place of its key in the file."""
-        return ConfigProblem(self.document.where(tuple(key.split("."))), key, rule, value, hint)
+        return self.document.problem(key, rule, value, hint)
 
     def noise_settings(self, number: int) -> list[str]:
         """Return the settings for other noise of a simulated device in each run of several."""
@@ -78,22 +78,24 @@ def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperimen
 
 def input_files(document: Document, path: Path) -> list[Path]:
     """Return the experiment file and the files that its keys name."""
-    found = [path]
-    for key in sorted(FILE_KEYS):
-        value: object = document.data
-        for name in key.split("."):
-            value = value.get(name) if isinstance(value, dict) else None
-        if isinstance(value, str):  # may be the name of a shipped profile
-            found.append(path.parent / value)
-    return found
+    names = [document.value(loc_of(key)) for key in sorted(FILE_KEYS)]
+    # A profile may be the name of a shipped one.
+    return [path, *(path.parent / name for name in names if isinstance(name, str))]
 
 
 def inputs_of(path: Path, settings: Sequence[str] = ()) -> list[Path]:
     """Return the files that a run of an experiment reads; raise InputError if it can't be read."""
-    document = load_document(path)
+    return input_files(
+        document_with(path, [named_from(path.parent, each) for each in settings]), path
+    )
+
+
+def document_with(path: Path, settings: Iterable[str], files: TextFiles | None = None) -> Document:
+    """Return an experiment file with ``key=value`` texts over it."""
+    document = load_document(path, files)
     for setting in settings:
-        document.set(named_from(path.parent, setting))
-    return input_files(document, path)
+        document.set(setting)
+    return document
 
 
 def named_from(folder: Path, setting: str) -> str:
@@ -118,9 +120,7 @@ def resolve(
 
     def named(key: str, load: Callable[[Path, TextFiles], T]) -> T | None:
         """Return the content of the file under a dotted key; None without the key."""
-        section, name_key = key.split(".")
-        keys = document.data.get(section)
-        name = keys.get(name_key) if isinstance(keys, dict) else None
+        name = document.value(loc_of(key))
         if not isinstance(name, str):
             return None
         try:
@@ -128,8 +128,7 @@ def resolve(
         except ConfigError:
             raise
         except InputError as error:
-            where = document.where((section, name_key))
-            raise ConfigError([ConfigProblem(where, key, str(error))]) from None
+            raise ConfigError([document.problem(key, str(error))]) from None
 
     config = _collect(problems, lambda: document.validate(Experiment))
     device = _collect(problems, lambda: made_device(document, folder, files))
@@ -146,28 +145,22 @@ def resolve(
     )
 
 
-def _joint_problems(config: Experiment, document: Document) -> list[ConfigProblem]:
-    """Return broken rules between sections of the experiment."""
-    found: list[ConfigProblem] = []
-
-    def add(loc: tuple[str, ...], rule: str, value: object = "", hint: str = "") -> None:
-        found.append(ConfigProblem(document.where(loc), ".".join(loc), rule, str(value), hint))
-
+def _joint_problems(config: Experiment, document: Document) -> Iterator[ConfigProblem]:
+    """Yield broken rules between sections of the experiment."""
     unit, limits = config.waveform.unit, config.limits
     if unit is None:
-        add(("waveform", "unit"), "is required", hint="um, A or V")
+        yield document.problem("waveform.unit", "is required", hint="um, A or V")
     elif config.compensator is not None and unit != "um":
-        add(("waveform", "unit"), "must be um with a compensator", unit)
+        yield document.problem("waveform.unit", "must be um with a compensator", unit)
     elif config.compensator is None and unit != limits.unit:
         rule = f"must be {limits.unit}, the unit of the limits, without a compensator"
-        add(("waveform", "unit"), rule, unit)
+        yield document.problem("waveform.unit", rule, unit)
     if config.amplifier is not None and limits.unit != "A":
-        add(("amplifier",), "is for a device driven in A", hint="remove it")
+        yield document.problem("amplifier", "is for a device driven in A", hint="remove it")
     low, high = limits.command_range
     if not low <= config.safe.value <= high:
         rule = f"must lie within the limits, {low:g} to {high:g} {limits.unit}"
-        add(("safe", "value"), rule, f"{config.safe.value:g}")
-    return found
+        yield document.problem("safe.value", rule, f"{config.safe.value:g}")
 
 
 def _collect(problems: list[ConfigProblem], load: Callable[[], T]) -> T | None:

@@ -97,13 +97,15 @@ def assumed_response(rate_hz: float, delay_s: float, resonance: FirstMode | None
     A resonance above half the sample rate is assumed there.
     """
     hz = np.geomspace(_LOWEST * rate_hz, 0.5 * rate_hz, _POINTS)
-    lag = 2.0 * math.pi * hz * (1.0 / rate_hz + delay_s)
-    if resonance is None:
-        return LoopResponse(hz, np.ones(hz.size), lag)
-    natural_hz = min(resonance.natural_hz, 0.5 * rate_hz)
-    hz = np.unique(np.append(hz, natural_hz))
+    natural_hz, damping_ratio = math.inf, 1.0
+    if resonance is not None:
+        natural_hz, damping_ratio = (
+            min(resonance.natural_hz, 0.5 * rate_hz),
+            resonance.damping_ratio,
+        )
+        hz = np.unique(np.append(hz, natural_hz))
     ratio = hz / natural_hz
-    mode = 1.0 / (1.0 - ratio**2 + 2j * resonance.damping_ratio * ratio)
+    mode = 1.0 / (1.0 - ratio**2 + 2j * damping_ratio * ratio)
     lag = 2.0 * math.pi * hz * (1.0 / rate_hz + delay_s)
     return LoopResponse(hz, np.abs(mode), lag - np.angle(mode))
 

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hilctl import __version__
-from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, RunError
+from hilctl.base.errors import ConfigError, HilctlError, RunError
 from hilctl.base.files import make_folder
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.segments import Segment
@@ -46,7 +46,7 @@ def repeating(checked: CheckedExperiment) -> list[Segment]:
     loaded = checked.loaded
 
     def refuse(key: str, rule: str, hint: str) -> ConfigError:
-        return ConfigError([ConfigProblem(loaded.document.where((key,)), key, rule, hint=hint)])
+        return ConfigError([loaded.problem(key, rule, hint=hint)])
 
     if loaded.model is None:
         raise refuse("compensator", "is needed to learn: its input is corrected", "set a model")

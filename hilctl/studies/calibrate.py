@@ -23,7 +23,7 @@ from hilctl.base.types import F64
 from hilctl.base.yaml import dump, load_document
 from hilctl.experiment.load import load_experiment
 from hilctl.recording.reader import read
-from hilctl.studies.characterise.characterisation_runner import unit_of, without_reference
+from hilctl.studies.characterise.characterisation_runner import without_reference
 from hilctl.studies.step_runner import StudyHost, raise_if_stopped, setting
 
 _HIGHEST_ORDER = 4
@@ -109,7 +109,8 @@ def fit_sensor(name: str, reading: F64, true: F64, origin: Origin) -> Calibratio
     residuals, freedom = true - curve(reading), reading.size - curve.coef.size
     shape: dict[str, Any] = {"polynomial": tuple(curve.convert().coef.tolist())}
     knots, mean = _averaged(reading, true)
-    left_out = mean[1:-1] - _between_neighbours(knots, mean)
+    share = (knots[1:-1] - knots[:-2]) / (knots[2:] - knots[:-2])  # between the neighbours
+    left_out = mean[1:-1] - (mean[:-2] + share * (mean[2:] - mean[:-2]))
     if _MUCH_BETTER * _rms(left_out) + 1e-9 * float(np.ptp(true)) < min(errors):
         shape = {"table": tuple(zip(knots.tolist(), mean.tolist(), strict=True))}
         reading, true, residuals, freedom = knots[1:-1], mean[1:-1], left_out, left_out.size
@@ -143,13 +144,6 @@ def _averaged(x: F64, y: F64) -> tuple[F64, F64]:
     return knots, np.bincount(at, y) / np.bincount(at)
 
 
-def _between_neighbours(x: F64, y: F64) -> F64:
-    """Return the interpolation between the neighbours of each inner point."""
-    share = (x[1:-1] - x[:-2]) / (x[2:] - x[:-2])
-    inner: F64 = y[:-2] + share * (y[2:] - y[:-2])
-    return inner
-
-
 def _rms(values: F64) -> float:
     return float(np.sqrt(np.mean(values**2)))
 
@@ -167,15 +161,13 @@ def measure_amplifier(
         InputError: The experiment is invalid, or its device does not measure; nothing has moved.
         RunError: The run ended early.
     """
-    settings = [*settings, *without_reference(experiment, settings), "condition=null"]
-    unit = unit_of(experiment, settings)
-    hold = {"kind": "hold", "unit": unit, "level": 0.0, "duration_s": 1.0}
-    loaded = load_experiment(experiment, [*settings, setting("waveform", hold)])
+    settings = [*without_reference(experiment, settings), "condition=null"]
+    loaded = load_experiment(experiment, settings)
     if loaded.document.holds(("device", "calibration")):
         settings.append("device.calibration=null")
     if not loaded.device.info.measures_command:
         raise InputError(f"{experiment}: device.measure: is required, to read the command back")
-    config = loaded.config
+    config, unit = loaded.config, loaded.config.limits.unit
     safe, rate_hz = config.safe.value, config.sample_rate_hz
     low, high = (safe + _PART * (end - safe) for end in config.limits.command_range)
     rising = np.linspace(low, high, _STEPS)

@@ -7,14 +7,12 @@ A killed study loses one run and resumes with the same command.
 import json
 import shutil
 import time
-from collections.abc import Callable, Iterable
+from collections.abc import Callable
 from dataclasses import dataclass, field
 from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import TextFiles
-from hilctl.base.yaml import Document, load_document
 from hilctl.run.result import RunResult
 from hilctl.run.start import StepStoppedError, paced
 
@@ -79,14 +77,6 @@ class StepRunner:
         left_s = round(self._total_s - done_s)
         left = f"{left_s // 3600}:{left_s // 60 % 60:02d}:{left_s % 60:02d} left"
         self._host.on_progress(done_s / self._total_s, f"{text}; {left}")
-
-
-def document_with(path: Path, settings: Iterable[str], files: TextFiles | None = None) -> Document:
-    """Return an experiment file with ``key=value`` texts over it."""
-    document = load_document(path, files)
-    for text in settings:
-        document.set(text)
-    return document
 
 
 def setting(key: str, value: Any) -> str:

@@ -12,7 +12,7 @@ from typing import Annotated, Any, cast
 
 import typer
 
-from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import finite_json
 from hilctl.base.types import CommandUnit
@@ -70,7 +70,7 @@ def wired_experiment(
     name = section.get("profile") if isinstance(section, dict) else None
     if not isinstance(section, dict) or not isinstance(name, str):
         rule = "must name a profile: what has none is not behind a wire, and needs no emulator"
-        raise ConfigError([ConfigProblem(document.where(("device",)), "device.profile", rule)])
+        raise ConfigError([document.problem("device.profile", rule)])
     options = _validated(document, path.parent, files)
     reader = options.reader
     unit = "A" if options.amplifier is None else options.amplifier.command_unit
@@ -125,7 +125,7 @@ def _actuator(
     for each in settings:
         document.set(each, "--actuator")
     of_device = [
-        ConfigProblem(document.where((key,)), key, "acts on simulated devices only")
+        document.problem(key, "acts on simulated devices only")
         for key in ("fault", "output_at_open")
         if document.holds((key,))
     ]

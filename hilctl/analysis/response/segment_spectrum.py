@@ -1,7 +1,7 @@
 """Spectrum of the displacement: harmonics of a sine, noise, drift and Allan deviation at rest."""
 
 import math
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -116,18 +116,11 @@ class SegmentSpectrum:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values, as ``hilctl spectrum --json`` prints them."""
-        return {**_plain(asdict(self)), "path": str(self.path)}
+        return {**asdict(self, dict_factory=_plain), "path": str(self.path)}
 
 
-def _plain(values: dict[str, Any]) -> dict[str, Any]:
-    return {
-        key: _plain(each)
-        if isinstance(each, dict)
-        else each.tolist()
-        if isinstance(each, np.ndarray)
-        else each
-        for key, each in values.items()
-    }
+def _plain(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    return {key: each.tolist() if isinstance(each, np.ndarray) else each for key, each in values}
 
 
 def spectra(recording: Recording) -> tuple[SegmentSpectrum, ...]:

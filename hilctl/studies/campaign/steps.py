@@ -19,8 +19,8 @@ from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import Document, Loc, dotted, load_document
 from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.file import Condition, Name
-from hilctl.experiment.load import LoadedExperiment, named_from, resolve
-from hilctl.studies.step_runner import document_with, setting
+from hilctl.experiment.load import LoadedExperiment, document_with, named_from, resolve
+from hilctl.studies.step_runner import setting
 
 RunOrder = Literal["as_written", "random", "alternating"]
 
@@ -219,13 +219,13 @@ class CampaignSteps:
         """Return all ``key=value`` texts of a step, outermost last."""
         # Each run of a simulated device gets its own, reproducible noise.
         settings = [*self.settings, *step.settings]
-        device = document_with(self.experiment, settings, files).data.get("device")
-        kind = device.get("kind") if isinstance(device, dict) else None
+        document = document_with(self.experiment, settings, files)
+        kind, first = (document.value(("device", key)) for key in ("kind", "seed"))
         if "device.seed" in self.keys or kind not in known_devices():
             return settings
-        field = device_class(str(kind)).Options.model_fields.get("seed")
-        first = device.get("seed", field.default) if field and isinstance(device, dict) else None
-        if isinstance(first, int):
+        field = device_class(kind).Options.model_fields.get("seed")
+        first = field.default if field and first is None else first
+        if field and isinstance(first, int):
             own = json.dumps([step.settings, step.repeat, step.is_reference])
             settings.append(f"device.seed={first + zlib.crc32(own.encode()) % _SEEDS}")
         return settings
@@ -262,8 +262,7 @@ def campaign_of(document: Document, folder: Path, settings: Sequence[str]) -> Ca
         if (by := next((each for each in fixed if f"{each}.".startswith(f"{key}.")), None))
     ]
     if config.condition is not None and "condition" in {key.split(".")[0] for key in keys}:
-        where = document.where(("condition",))
-        problems.append(ConfigProblem(where, "condition", "must not be set, because it is varied"))
+        problems.append(document.problem("condition", "must not be set, because it is varied"))
     if problems:
         raise ConfigError(problems)
     steps = tuple(_steps(config, points(groups, config.order, config.seed, config.repeat)))
@@ -284,21 +283,14 @@ def _steps(config: CampaignFile, found: Sequence[tuple[Point, int]]) -> Iterator
     if config.condition is not None:
         common.append(setting("condition", config.condition.model_dump(exclude_unset=True)))
     reference = config.reference_run
-    number = again = 0
-    for place, (point, repeat) in enumerate(found):
-        if reference is not None and place % reference.every == 0:
-            number, again = number + 1, again + 1
-            yield _reference(number, again, common, reference.set)
-        number += 1
-        yield CampaignStep(number, point, repeat, False, (*common, *settings_of(point)))
+    runs: list[tuple[Point, int, bool]] = [(point, repeat, False) for point, repeat in found]
     if reference is not None:
-        yield _reference(number + 1, again + 1, common, reference.set)
-
-
-def _reference(
-    number: int, again: int, common: list[str], given: Mapping[str, Any]
-) -> CampaignStep:
-    return CampaignStep(number, {}, again, True, (*common, *settings_of(given)))
+        places = [*range(0, len(found), reference.every), len(found)]
+        for again, place in reversed(list(enumerate(places, 1))):
+            runs.insert(place, ({}, again, True))
+    for number, (point, repeat, is_reference) in enumerate(runs, 1):
+        own = reference.set if reference and is_reference else point
+        yield CampaignStep(number, point, repeat, is_reference, (*common, *settings_of(own)))
 
 
 def settings_of(given: Mapping[str, Any]) -> list[str]:
@@ -320,5 +312,4 @@ def cell(value: Any) -> Any:
 
 def base_problem(campaign: CampaignSteps, error: InputError) -> ConfigError:
     """Return the error for a base experiment that can't be read."""
-    where = campaign.document.where(("experiment",))
-    return ConfigError([ConfigProblem(where, "experiment", str(error))])
+    return ConfigError([campaign.document.problem("experiment", str(error))])

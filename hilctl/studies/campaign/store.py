@@ -10,13 +10,13 @@ from mcap.writer import MCAP0_MAGIC
 from hilctl.base.errors import ConfigError, DataError, InputError
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
 from hilctl.experiment.file import RecordingConfig
+from hilctl.experiment.load import document_with
 from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.run_summary import read_ends, recordings_in
 from hilctl.run.run_folder import runs
 from hilctl.run.start import RunKey, completed_key
 from hilctl.studies.campaign.steps import CampaignSteps, base_problem, settings_of
-from hilctl.studies.step_runner import document_with
 
 _LONGEST_WAIT_S = 60.0
 _POLL_S = 0.1
@@ -34,8 +34,7 @@ def campaign_folder(campaign: CampaignSteps) -> Path:
         raise
     except InputError as error:
         raise base_problem(campaign, error) from None
-    recording = document.data.get("recording")
-    given = recording.get("folder") if isinstance(recording, dict) else None
+    given = document.value(("recording", "folder"))
     return Path(given if isinstance(given, str) else RecordingConfig().folder) / config.name
 
 

@@ -9,10 +9,10 @@ from pathlib import Path
 
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
 from hilctl.base.files import check_writable, make_folder, write_text
-from hilctl.base.types import F64, CommandUnit
+from hilctl.base.types import F64
 from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_before
-from hilctl.experiment.load import load_experiment
+from hilctl.experiment.load import document_with, load_experiment
 from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import dump_model
@@ -34,7 +34,6 @@ from hilctl.studies.characterise.waveforms import FIRST_PARTS, Keys, at_rest, fi
 from hilctl.studies.step_runner import (
     StepRunner,
     StudyHost,
-    document_with,
     free_mb,
     raise_if_stopped,
     require_room,
@@ -42,19 +41,14 @@ from hilctl.studies.step_runner import (
 )
 
 
-def unit_of(experiment: Path, settings: Sequence[str]) -> CommandUnit:
-    """Return the command unit of an experiment."""
-    return "V" if document_with(experiment, settings).holds(("limits", "drive_v")) else "A"
-
-
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
-    """Return settings that remove the compensator and everything that needs one."""
+    """Return settings with a hold as waveform, without a compensator and all that needs one."""
     document = document_with(experiment, settings)
-    found = ["compensator=none"]
-    found += [f"{key}=null" for key in ("feedback", "adaptation") if document.holds((key,))]
-    return found + [
-        f"limits.{key}=null" for key in _tracking_keys() if document.holds(("limits", key))
-    ]
+    unit = "V" if document.holds(("limits", "drive_v")) else "A"
+    hold = {"kind": "hold", "unit": unit, "level": 0.0, "duration_s": 1.0}
+    needing = ("feedback", "adaptation", *(f"limits.{key}" for key in _tracking_keys()))
+    removed = [f"{key}=null" for key in needing if document.holds(tuple(key.split(".")))]
+    return [*settings, setting("waveform", hold), "compensator=none", *removed]
 
 
 def _tracking_keys() -> Iterator[str]:
@@ -108,14 +102,11 @@ class CharacterisationRunner:
         highest_hz: float | None = None,  # of loops; derived from the sample rate if None
         host: StudyHost | None = None,
     ) -> None:
-        self._experiment = experiment
-        self._given = settings
-        self._settings = [*settings, *without_reference(experiment, settings)]
+        self._experiment, self._given = experiment, settings
+        self._settings = without_reference(experiment, settings)
         self._folder = folder
         self._host = host or StudyHost()
-        first = {"kind": "hold", "unit": unit_of(experiment, self._settings), "level": 0.0}
-        hold = setting("waveform", {**first, "duration_s": 1.0})
-        self._loaded = load_experiment(experiment, [*self._settings, hold])
+        self._loaded = load_experiment(experiment, self._settings)
         self.limits = limits_of(self._loaded, highest_hz)
         info = self._loaded.device.info
         if self._host.run is unpaced and not info.simulated:
@@ -159,9 +150,7 @@ class CharacterisationRunner:
     def discard(self) -> None:
         """Delete the recordings of all steps."""
         for number, step in enumerate(STEPS, 1):
-            path = self._path(number, step)
-            if path.is_file():
-                path.unlink()
+            self._path(number, step).unlink(missing_ok=True)
 
     def characterise(self, output: Path, *, overwrite: bool = False) -> Characterisation:
         """Run all steps, then identify and validate the model and write it to ``output``.
@@ -175,25 +164,24 @@ class CharacterisationRunner:
         check_writable(output, overwrite=overwrite)
         require_room(self._folder, self.plan.megabytes, self.plan.free_mb)
         make_folder(self._folder)
-        result = Characterisation(
-            experiment=self._loaded.config.name,
-            device=self._loaded.device.info.name,
-            unit=self.limits.unit,
-            band_hz=(self.limits.lowest_hz, self.limits.highest_hz),
-            steps=(),
-            measured=self._measured,
-        )
         try:
             for number, step in enumerate(STEPS, 1):
                 keys = step.waveform(self.limits, self._measured)
                 if keys is not None:
                     self._do(number, step, keys)
-            return self._with_model(result, output, overwrite=overwrite)
+            return self._with_model(output, overwrite=overwrite)
         except RigProblemError as error:
-            return replace(self._so_far(result), problem=str(error), problem_code=error.code)
+            return replace(self._so_far(), problem=str(error), problem_code=error.code)
 
-    def _so_far(self, result: Characterisation) -> Characterisation:
-        return replace(result, steps=tuple(self._rows), measured=self._measured)
+    def _so_far(self) -> Characterisation:
+        return Characterisation(
+            experiment=self._loaded.config.name,
+            device=self._loaded.device.info.name,
+            unit=self.limits.unit,
+            band_hz=(self.limits.lowest_hz, self.limits.highest_hz),
+            steps=tuple(self._rows),
+            measured=self._measured,
+        )
 
     def _do(self, number: int, step: CharacterisationStep, keys: Keys) -> None:
         keys, command = within(self.limits, keys)
@@ -267,9 +255,7 @@ class CharacterisationRunner:
         last = CoolingCoil(self._loaded.config, heat_before(self._loaded, now_s), now_s)
         return max(coil.pause_s(heat, now_s) for coil in (self._coil, last))
 
-    def _with_model(
-        self, result: Characterisation, output: Path, *, overwrite: bool
-    ) -> Characterisation:
+    def _with_model(self, output: Path, *, overwrite: bool) -> Characterisation:
         self._host.on_progress(1.0, "identify")
         rest = self._measured.rest
         try:
@@ -278,7 +264,7 @@ class CharacterisationRunner:
         except InputError as error:
             remedy = "check the loops on the page, or run 'hilctl identify' on the recordings"
             raise RigProblemError("no_model", f"no model identified: {error}", remedy) from None
-        result = replace(self._so_far(result), held_out=apart, identification=found)
+        result = replace(self._so_far(), held_out=apart, identification=found)
         if not result.is_model:
             return result
         write_text(output, dump_model(found.fit.model), overwrite=overwrite)
@@ -287,8 +273,7 @@ class CharacterisationRunner:
     def _first_run(self, output: Path, model: HysteresisModel) -> tuple[str, ...]:
         """Return the settings of a run through the model; empty if its check fails."""
         named = [*self._given, f"compensator.model={json.dumps(str(output))}"]
-        waveform = document_with(self._experiment, self._given).data.get("waveform")
-        own = isinstance(waveform, dict) and waveform.get("unit") == "um"
+        own = document_with(self._experiment, self._given).value(("waveform", "unit")) == "um"
         for part in FIRST_PARTS:
             keys = [] if own else [setting("waveform", first_run(self.limits, model, part))]
             with suppress(ConfigError):

@@ -1,7 +1,7 @@
 """Results of a characterisation: measurements, model, and validation."""
 
-from collections.abc import Mapping
-from dataclasses import asdict, dataclass, fields, replace
+from collections.abc import Iterable, Mapping
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -49,7 +49,7 @@ class Measured:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values without signals."""
-        return {field.name: _plain(getattr(self, field.name)) for field in fields(self)}
+        return asdict(self, dict_factory=_without_signals)
 
 
 @dataclass(frozen=True, slots=True)
@@ -132,7 +132,7 @@ class Characterisation:
         """Return plain values for JSON, the validation errors first."""
         found = self.identification
         return {
-            "held_out": [_plain(each) for each in self.held_out],
+            "held_out": [asdict(each, dict_factory=_without_signals) for each in self.held_out],
             "verdict": None if self.verdict is None else self.verdict.to_mapping(),
             "problem": self.problem or None,
             "problem_code": self.problem_code or None,
@@ -148,22 +148,14 @@ class Characterisation:
         }
 
 
-def _plain(value: Any) -> Any:
-    """Return plain values without signals."""
-    if isinstance(value, tuple):
-        return [_plain(each) for each in value if not isinstance(each, np.ndarray)]
-    if isinstance(value, Mapping):
-        return {key: _plain(each) for key, each in value.items()}
-    if hasattr(value, "__dataclass_fields__"):
-        named = {field.name: getattr(value, field.name) for field in fields(value)}
-        return {key: _plain(each) for key, each in named.items() if not _is_signal(each)}
-    return str(value) if isinstance(value, Path) else value
-
-
-def _is_signal(value: Any) -> bool:
-    return isinstance(value, np.ndarray) or (
-        isinstance(value, tuple) and bool(value) and isinstance(value[0], np.ndarray)
-    )
+def _without_signals(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
+    """Return fields as plain values, without arrays and tuples of arrays."""
+    kept = {}
+    for name, value in values:
+        many = list(value) if isinstance(value, tuple) else None
+        if not isinstance(many[0] if many else value, np.ndarray):
+            kept[name] = str(value) if isinstance(value, Path) else value if many is None else many
+    return kept
 
 
 _SLACK = 0.01

@@ -12,7 +12,6 @@ from hilctl.run.start import StepStoppedError, unpaced
 from hilctl.studies.characterise import characterisation_runner
 from hilctl.studies.characterise.characterisation_runner import (
     CharacterisationRunner,
-    unit_of,
     without_reference,
 )
 from hilctl.studies.characterise.steps import STEPS
@@ -35,7 +34,7 @@ def short(monkeypatch):
     monkeypatch.setattr(characterisation_runner, "STEPS", SHORT)
     monkeypatch.setattr(characterisation_runner, "identified", lambda *_, **__: None)
     monkeypatch.setattr(
-        CharacterisationRunner, "_with_model", lambda self, result, *_, **__: self._so_far(result)
+        CharacterisationRunner, "_with_model", lambda self, *_, **__: self._so_far()
     )
 
 
@@ -234,8 +233,9 @@ def test_settings_that_need_a_reference_are_removed(tmp_path, limits):
     assert len(loaded.config.waveform.parts) == len(keys["parts"])
 
 
-def test_an_experiment_without_all_that_is_left_as_it_is(experiment):
-    assert without_reference(experiment, []) == ["compensator=none"]
-    assert unit_of(experiment, []) == "A"
-    volts = ["limits={drive_v: [0, 1], slew_v_per_s: 1.0, stroke_um: [0, 1]}"]
-    assert unit_of(experiment, volts) == "V"
+def test_an_experiment_without_all_that_is_held_in_its_unit(experiment):
+    volts = "limits={drive_v: [0, 1], slew_v_per_s: 1.0, stroke_um: [0, 1]}"
+    for given, unit in (([], "A"), ([volts], "V")):
+        *kept, waveform, compensator = without_reference(experiment, given)
+        assert (kept, compensator) == (given, "compensator=none")
+        assert f'"unit": "{unit}"' in waveform
