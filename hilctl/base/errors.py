@@ -17,9 +17,13 @@ from dataclasses import dataclass
 class HilctlError(Exception):
     """Base of all errors raised on purpose; the text is shown to the user."""
 
+    exit_code = 3
+
 
 class InputError(HilctlError):
     """Invalid input, such as a missing file or a value out of range."""
+
+    exit_code = 2
 
 
 @dataclass(frozen=True, slots=True)

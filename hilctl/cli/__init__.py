@@ -10,10 +10,10 @@ control.py        status, set, mark, stop
 live.py           watch, live
 recordings.py     list, export, recover
 reports.py        report, figures, replay
-models.py         identify, refine, compare
+models.py         identify, refine, compare, export-model
 campaigns.py      campaign, sweep, learn
-calibrate.py      calibrate
-characterise.py   characterise
+rig.py            calibrate, characterise
+responses.py      frf, spectrum, step, tune
 devices.py        doctor, devices
 
 Exit codes: 0 success; 1 a replay that differs, an incomplete export, a rate that this computer does
@@ -26,7 +26,7 @@ import signal
 import sys
 from typing import NoReturn
 
-from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
+from hilctl.base.errors import ConfigError, HilctlError, RunError
 from hilctl.base.files import reason
 from hilctl.cli.output import (
     output_as_requested,
@@ -91,6 +91,6 @@ def _refuse(error: HilctlError) -> NoReturn:
     if "--json" in sys.argv:
         problems = [str(p) for p in error.problems] if isinstance(error, ConfigError) else []
         print_json({"error": str(error), "problems": problems})
-    for line in str(error).splitlines():
+    for line in [*str(error).splitlines(), *getattr(error, "__notes__", ())]:
         print(f"hilctl: {line}", file=sys.stderr)
-    raise SystemExit(2 if isinstance(error, InputError) else 3)
+    raise SystemExit(error.exit_code)

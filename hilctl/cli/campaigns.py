@@ -26,6 +26,7 @@ from hilctl.cli.options import (
     Fast,
     LabelTexts,
     Overwrite,
+    RunsFolder,
     Settings,
     experiment_keys,
 )
@@ -33,6 +34,7 @@ from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.file import label_settings
 from hilctl.ilc.ilc_session import IlcResult, IlcRow, correction_setting
 from hilctl.run.control.client import finish_dead_runs
+from hilctl.run.start import StepStoppedError
 from hilctl.studies.campaign.campaign_runner import CampaignResult
 from hilctl.studies.campaign.plan import CampaignPlan
 from hilctl.studies.campaign.steps import (
@@ -150,8 +152,8 @@ def _run_campaign(
                 fast=fast, scheduler=scheduler, dry_run=dry_run, on_plan=on_plan,
             )  # fmt: skip
         except KeyboardInterrupt:  # between two runs, or while the coil cools
-            print(f"hilctl: stopped by Ctrl-C between two steps; {_RESUMES}", file=sys.stderr)
-            raise typer.Exit(128 + signal.SIGINT) from None
+            text = f"stopped by Ctrl-C between two steps; {_RESUMES}"
+            raise StepStoppedError(text, signal.SIGINT) from None
     if result is not None:
         _finish(result, as_json=as_json)
 
@@ -265,10 +267,7 @@ def print_row(varied: Sequence[VariedParameter], step: CampaignStep, row: Campai
         ]
         text = "  ".join(form.format(value) for value, form in parts if value is not None)
     kept = "done earlier  " if row.kept else ""
-    print(
-        f"{step.number:4d}  {values}  {kept}{text}",
-        flush=True,
-    )
+    print(f"{step.number:4d}  {values}  {kept}{text}", flush=True)
 
 
 def result_mapping(result: CampaignResult) -> dict[str, Any]:
@@ -305,9 +304,7 @@ def learn(
     cycles: Annotated[
         int, typer.Option(min=1, max=200, help="Largest number of runs after the first.")
     ] = 20,
-    folder: Annotated[
-        Path | None, typer.Option(help="Folder for the recordings; default: OUTPUT-runs.")
-    ] = None,
+    folder: RunsFolder = None,
     settings: Settings = None,
     labels: LabelTexts = None,
     fast: Fast = False,

@@ -13,7 +13,14 @@ from hilctl import api
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable
 from hilctl.cli.console import listing, print_rich, progress_bar, table
-from hilctl.cli.options import AsJson, Overwrite, Settings, recording_paths
+from hilctl.cli.options import (
+    AsJson,
+    HtmlPage,
+    Overwrite,
+    Settings,
+    recording_paths,
+    recordings_argument,
+)
 from hilctl.cli.output import print_result
 from hilctl.comparison.compare import Comparison, headings, notes, table_rows
 from hilctl.identify.model_selection import OrderScore
@@ -43,14 +50,6 @@ def _setting_keys() -> list[tuple[str, str]]:
     return [(f"{row[0]}=", row[-1]) for row in setting_rows()]
 
 
-IdentifyInput = Annotated[
-    list[Path],
-    typer.Argument(
-        metavar="FILE",
-        help="Recordings (MCAP) or tables (text, .mat, .npz, .npy, .parquet).",
-        autocompletion=recording_paths,
-    ),
-]
 TableUnit = Annotated[str | None, typer.Option(help="Unit of the command in a table, A or V.")]
 TableColumn = Annotated[str | None, typer.Option(help="Column of a table: name, or number from 1.")]
 TableScale = Annotated[
@@ -69,6 +68,8 @@ LeaveOut = Annotated[
         metavar="LABEL", help="Loop to omit (its label, or the beginning of it); may be repeated."
     ),
 ]
+ModelArgument = Annotated[Path, typer.Argument(help="Model file.", metavar="MODEL")]
+ModelFile = Annotated[Path | None, typer.Option(help="Model file to write.")]
 Validate = Annotated[
     list[Path] | None,
     typer.Option(
@@ -90,14 +91,6 @@ FitTexts = Annotated[
         metavar="KEY=VALUE",
         help="Setting of the fit (see --settings); may be repeated.",
         autocompletion=_setting_keys,
-    ),
-]
-ValidateRuns = Annotated[
-    list[Path] | None,
-    typer.Option(
-        metavar="RUN",
-        help="Recording to validate the model with; may be repeated.",
-        autocompletion=recording_paths,
     ),
 ]
 Models = Annotated[
@@ -141,11 +134,16 @@ ListSettings = Annotated[
 
 
 def identify(
-    files: IdentifyInput,
+    files: Annotated[
+        list[Path],
+        recordings_argument(
+            "Recordings (MCAP) or tables (text, .mat, .npz, .npy, .parquet).", "FILE"
+        ),
+    ],
     model: Annotated[
         str, typer.Option(help="Kind of model, or auto.", autocompletion=_kinds)
     ] = "auto",
-    output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
+    output: ModelFile = None,
     settings: FitTexts = None,
     list_settings: ListSettings = False,
     unit: TableUnit = None,
@@ -160,9 +158,7 @@ def identify(
     leave_out: LeaveOut = None,
     validate: Validate = None,
     scheduler: Scheduler = None,
-    html: Annotated[
-        Path | None, typer.Option(help="HTML page that compares model and data, to write.")
-    ] = None,
+    html: HtmlPage = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -213,24 +209,17 @@ def column_of(text: str | None) -> str | int | None:
 
 
 def refine(
-    model: Annotated[Path, typer.Argument(help="Model file.", metavar="MODEL")],
+    model: ModelArgument,
     runs: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUN",
-            help="Recordings (MCAP): compensated, learned, or neither.",
-            autocompletion=recording_paths,
-        ),
+        list[Path], recordings_argument("Recordings (MCAP): compensated, learned, or neither.")
     ],
-    output: Annotated[Path | None, typer.Option(help="Model file to write.")] = None,
-    validate: ValidateRuns = None,
+    output: ModelFile = None,
+    validate: Validate = None,
     tolerance_percent: Annotated[
         float,
         typer.Option(help="Increase of a run's rms error to accept, percent of its peak-to-peak."),
     ] = TOLERANCE_PERCENT,
-    html: Annotated[
-        Path | None, typer.Option(help="HTML page that compares both models, to write.")
-    ] = None,
+    html: HtmlPage = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
@@ -275,7 +264,7 @@ def print_refinement(result: Refinement, output: Path | None) -> None:
 
 
 def export_model(
-    model: Annotated[Path, typer.Argument(help="Model file.", metavar="MODEL")],
+    model: ModelArgument,
     output: Annotated[
         Path,
         typer.Argument(
@@ -295,19 +284,12 @@ def export_model(
 
 
 def compare(
-    files: Annotated[
-        list[Path],
-        typer.Argument(
-            metavar="RUN", help="Recordings (MCAP) of steady loops.", autocompletion=recording_paths
-        ),
-    ],
+    files: Annotated[list[Path], recordings_argument("Recordings (MCAP) of steady loops.")],
     models: Models = None,
     experiment: TryIn = None,
     frequencies: Frequencies = None,
     points: Annotated[int, typer.Option(min=16, help="Points per loop.")] = 300,
-    html: Annotated[
-        Path | None, typer.Option(help="HTML page with table and plot to write.")
-    ] = None,
+    html: HtmlPage = None,
     save: Annotated[Path | None, typer.Option(help="Folder for the model files.")] = None,
     settings: Settings = None,
     overwrite: Overwrite = False,

@@ -70,12 +70,20 @@ def _keys(node: dict[str, Any], definitions: dict[str, Any], at: str = "") -> It
         yield at, node.get("description", "")
 
 
+def recordings_argument(meaning: str, metavar: str = "RUN") -> Any:
+    """Return an argument for the files of recordings."""
+    return typer.Argument(help=meaning, metavar=metavar, autocompletion=recording_paths)
+
+
 ExperimentFile = Annotated[
     Path, typer.Argument(help="Experiment file (YAML).", metavar="EXPERIMENT")
 ]
-RecordingFile = Annotated[
-    Path,
-    typer.Argument(help="Recording (MCAP).", metavar="RUN", autocompletion=recording_paths),
+RecordingFile = Annotated[Path, recordings_argument("Recording (MCAP).")]
+HtmlPage = Annotated[
+    Path | None, typer.Option(metavar="FILE", help="HTML page with tables and plots to write.")
+]
+RunsFolder = Annotated[
+    Path | None, typer.Option(help="Folder for the recordings; default: OUTPUT-runs.")
 ]
 Settings = Annotated[
     list[str] | None,

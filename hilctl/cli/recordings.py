@@ -16,7 +16,7 @@ from hilctl.api.tables import RunTable
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import finite_json, printable
 from hilctl.cli.console import progress_bar
-from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime, recording_paths
+from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime, recordings_argument
 from hilctl.cli.output import print_json, print_result
 from hilctl.recording.metadata_keys import RECORDINGS
 from hilctl.recording.recover import recover_recording
@@ -73,11 +73,7 @@ def _print_table(entries: RunTable, count: int) -> None:
 def export(
     recording: Annotated[
         Path,
-        typer.Argument(
-            metavar="RUN",
-            help="Recording (MCAP), or a folder of recordings with --all.",
-            autocompletion=recording_paths,
-        ),
+        recordings_argument("Recording (MCAP), or a folder of recordings with --all."),
     ],
     output: Annotated[
         Path,
@@ -122,10 +118,7 @@ def _export_all(folder: Path, output: Path, *, as_json: bool) -> None:
 
 
 def recover(
-    recording: Annotated[
-        Path | None,
-        typer.Argument(metavar="RUN", help="Recording (MCAP).", autocompletion=recording_paths),
-    ] = None,
+    recording: Annotated[Path | None, recordings_argument("Recording (MCAP).")] = None,
     output: Annotated[Path | None, typer.Option(help="File to write; RUN stays unchanged.")] = None,
     dismissed: Annotated[
         str | None,

@@ -12,7 +12,16 @@ from hilctl.analysis.replay import ReplayResult
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import printable, quantity
 from hilctl.cli.console import console, print_rich, progress_bar, table
-from hilctl.cli.options import AsJson, FromTime, Overwrite, RecordingFile, ToTime, recording_paths
+from hilctl.cli.options import (
+    AsJson,
+    FromTime,
+    HtmlPage,
+    Overwrite,
+    RecordingFile,
+    ToTime,
+    recording_paths,
+    recordings_argument,
+)
 from hilctl.cli.output import print_result
 from hilctl.cli.run import render_report
 from hilctl.run.control.client import finish_dead_runs
@@ -20,14 +29,7 @@ from hilctl.run.control.client import finish_dead_runs
 if TYPE_CHECKING:
     from hilctl.studies.multi_run.collect import RunSeries
 
-RunsInput = Annotated[
-    list[Path],
-    typer.Argument(
-        help="Recordings (MCAP), or a campaign folder.",
-        metavar="RUN",
-        autocompletion=recording_paths,
-    ),
-]
+RunsInput = Annotated[list[Path], recordings_argument("Recordings (MCAP), or a campaign folder.")]
 OtherModel = Annotated[
     Path | None,
     typer.Option(help="Model to compare with measured loops; default: the recorded one."),
@@ -38,9 +40,7 @@ FOLDER = "figures"
 
 def report(
     runs: RunsInput,
-    html: Annotated[
-        Path | None, typer.Option(metavar="FILE", help="HTML page with plots to write.")
-    ] = None,
+    html: HtmlPage = None,
     before: Annotated[
         Path | None,
         typer.Option(

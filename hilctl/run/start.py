@@ -149,7 +149,7 @@ class StepStoppedError(RunError):
 
     def __init__(self, text: str, number: int) -> None:
         super().__init__(text)
-        self.signal = number
+        self.signal, self.exit_code = number, 128 + number
 
 
 @dataclass(frozen=True, slots=True)

@@ -1,4 +1,4 @@
-"""The commands characterise and frf: output, files, refusals and exit codes."""
+"""The commands calibrate and characterise: output, files, refusals and exit codes."""
 
 import json
 from dataclasses import replace
@@ -6,16 +6,15 @@ from pathlib import Path
 
 import pytest
 
+from hilctl.base.calibration import CalibrationFile
 from hilctl.base.errors import RunError
-from hilctl.cli.characterise import plan_mapping, print_characterisation, print_plan, print_step
+from hilctl.base.yaml import load_document
+from hilctl.cli.rig import plan_mapping, print_characterisation, print_plan, print_step
 from hilctl.run.start import StepStoppedError, paced, unpaced
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.studies.characterise.results import Characterisation, StepRow
-from tests.unit.analysis.response.test_bode import SMALL
 from tests.unit.studies.characterise.conftest import experiment, limits, limits_with
 from tests.unit.studies.characterise.test_results import FOUND, identification
-
-RUN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 
 __all__ = ["experiment", "limits", "limits_with"]
 
@@ -169,26 +168,25 @@ def test_validation_error_is_printed_first(capsys):
     assert "model: model.yaml" in shown
 
 
-def test_frequency_responses_are_tables_or_json(monkeypatch, tmp_path, hilctl, json_of):
-    monkeypatch.setattr("hilctl.api.frf", lambda runs, *_, **__: (SMALL,) * len(runs))
-    code, shown, _ = hilctl("frf", "a.mcap", "b.mcap")
+ORIGIN = ("--by", "N. N.", "--reference", "interferometer")
+
+
+@pytest.fixture
+def pairs(tmp_path):
+    path = tmp_path / "pairs.csv"
+    path.write_text("reading,true\n" + "".join(f"{i},{2 * i + 1}\n" for i in range(5)))
+    return path
+
+
+def test_a_sensor_is_calibrated_once(hilctl, pairs, tmp_path):
+    output = tmp_path / "calibration.yaml"
+    arguments = ("calibrate", "sensor", pairs, "--output", output, *ORIGIN)
+    code, shown, _ = hilctl(*arguments, "--json")
+    printed = json.loads(shown)
     assert code == 0
-    assert shown.count("natural frequency") == 2
-    assert max(map(len, shown.splitlines())) <= 80
-    assert json_of("frf", "a.mcap")[1]["responses"][0]["natural_hz"] == SMALL.natural_hz
-
-
-@pytest.mark.parametrize("command", ["frf", "step", "tune"])
-def test_a_run_without_a_response_is_refused(hilctl, command):
-    assert hilctl(command, RUN)[0] == 2
-
-
-def test_spectra_are_rows_or_json(tmp_path, hilctl, json_of):
-    page = tmp_path / "page.html"
-    code, found = json_of("spectrum", RUN, "--html", page)
-    (segment,) = found["spectra"]
-    assert (code, page.exists(), segment["rest"]) == (0, True, None)
-    assert len(segment["sine"]["harmonics_um"]) == 20
-    assert "THD" in hilctl("spectrum", RUN)[1]
-    assert hilctl("spectrum", RUN, "--html", page)[0] == 2
-    assert hilctl("spectrum", RUN, RUN, "--from", "99")[0] == 2
+    assert printed["polynomial"] == pytest.approx([1.0, 2.0])
+    assert printed["output"] == str(output)
+    written = load_document(output).validate(CalibrationFile).sensor
+    assert (written.by, written.reference, written.range_um) == (ORIGIN[1], ORIGIN[3], (0.0, 4.0))
+    assert hilctl(*arguments)[0] == 2
+    assert hilctl(*arguments, "--overwrite")[0] == 0
