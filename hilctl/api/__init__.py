@@ -51,47 +51,13 @@ if TYPE_CHECKING:
     from hilctl.api.tables import RunTable, SampleTable
 
 __all__ = [
-    "ConfigError",
-    "DataError",
-    "DeviceError",
-    "HilctlError",
-    "InputError",
-    "LoadedModel",
-    "ModelError",
-    "RecordedRun",
-    "RunConnection",
-    "RunError",
-    "RunTable",
-    "SampleTable",
-    "WrittenExperiment",
-    "calibrate_amplifier",
-    "calibrate_sensor",
-    "campaign",
-    "characterise",
-    "check",
-    "compare",
-    "connect",
-    "export",
-    "export_model",
-    "figures",
-    "frf",
-    "identify",
-    "init",
-    "learn",
-    "list_runs",
-    "load",
-    "load_model",
-    "read",
-    "refine",
-    "replay",
-    "report_page",
-    "report_runs",
-    "run",
-    "spectrum",
-    "step",
-    "summarize",
-    "tune",
-]
+    "ConfigError", "DataError", "DeviceError", "HilctlError", "InputError", "LoadedModel",
+    "ModelError", "RecordedRun", "RunConnection", "RunError", "RunTable", "SampleTable",
+    "WrittenExperiment", "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise",
+    "check", "compare", "connect", "export", "export_model", "figures", "frf", "identify", "init",
+    "learn", "list_runs", "load", "load_model", "read", "refine", "replay", "report_page",
+    "report_runs", "run", "spectrum", "step", "summarize", "tune",
+]  # fmt: skip
 
 
 def __dir__() -> list[str]:
@@ -102,34 +68,16 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:
     _OTHERS = {
         "campaigns": {
-            "calibrate_amplifier",
-            "calibrate_sensor",
-            "campaign",
-            "characterise",
-            "learn",
+            "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise", "learn",
         },
         "connection": {"RunConnection", "connect"},
-        "models": {
-            "LoadedModel",
-            "compare",
-            "export_model",
-            "identify",
-            "load_model",
-            "refine",
-        },
+        "models": {"LoadedModel", "compare", "export_model", "identify", "load_model", "refine"},
         "reports": {
-            "figures",
-            "frf",
-            "replay",
-            "report_page",
-            "report_runs",
-            "spectrum",
-            "step",
-            "tune",
+            "figures", "frf", "replay", "report_page", "report_runs", "spectrum", "step", "tune",
         },
         "runs": {"WrittenExperiment", "check", "init", "load", "run"},
         "tables": {"RunTable", "SampleTable"},
-    }
+    }  # fmt: skip
 
     def __getattr__(name):
         """Return a public name; its module is imported when it is first used."""

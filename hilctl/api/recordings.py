@@ -85,6 +85,17 @@ def stream_of(
     return RecordingStream(Path(run), _time_range(from_s, to_s))
 
 
+def recording_of(
+    run: RecordedRun | PathLike, from_s: float | None = None, to_s: float | None = None
+) -> Recording | RecordingStream:
+    """Return a recording in memory, or one to be read in pieces, which a time range needs."""
+    if not isinstance(run, RecordedRun):
+        return stream_of(run, from_s, to_s)
+    if _time_range(from_s, to_s) is not None:
+        raise InputError("from_s and to_s apply to a file only: use them in read() instead")
+    return run.recording
+
+
 def summarize(
     run: RecordedRun | PathLike, *, from_s: float | None = None, to_s: float | None = None
 ) -> RunReport:
@@ -99,7 +110,7 @@ def summarize(
         InputError: The file does not exist.
         DataError: The file is not a recording.
     """
-    return judge(run.recording if isinstance(run, RecordedRun) else stream_of(run, from_s, to_s))
+    return judge(recording_of(run, from_s, to_s))
 
 
 def export(
@@ -123,12 +134,7 @@ def export(
         InputError: A file cannot be read or written, or the format is unknown; nothing is written.
         DataError: There is no sample.
     """
-    time_range = _time_range(from_s, to_s)
-    if isinstance(run, RecordedRun):
-        if time_range is not None:
-            raise InputError("from_s and to_s apply to a file only: use them in read() instead")
-        return write(run.recording, Path(output), overwrite=overwrite)
-    return write(stream_of(run, from_s, to_s), Path(output), overwrite=overwrite)
+    return write(recording_of(run, from_s, to_s), Path(output), overwrite=overwrite)
 
 
 def list_runs(

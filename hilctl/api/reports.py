@@ -28,7 +28,7 @@ from hilctl.analysis.response.step_response import step_response as measured_ste
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.analysis.run_page import run_sheets, write_html
 from hilctl.api._types import PathLike, Paths, paths_of
-from hilctl.api.recordings import RecordedRun, read, stream_of
+from hilctl.api.recordings import RecordedRun, read, recording_of, stream_of
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable
 from hilctl.experiment.open_loop import write_response
@@ -249,8 +249,7 @@ def replay(run: RecordedRun | PathLike, model: PathLike | None = None) -> Replay
         DataError: The file is not a recording, or cannot be replayed.
     """
     other = None if model is None else load_model(Path(model))
-    recorded = run.recording if isinstance(run, RecordedRun) else stream_of(run)
-    return recompute(recorded, other)
+    return recompute(recording_of(run), other)
 
 
 def figures(
