@@ -12,13 +12,13 @@ import json
 import logging
 import math
 import os
-from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from datetime import datetime
 from itertools import chain
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated
+from typing import Annotated
 
 import numpy as np
 
@@ -34,9 +34,6 @@ from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.metadata_keys import HEAT_FACT
 from hilctl.recording.run_summary import read_ends
-
-if TYPE_CHECKING:
-    from hilctl.recording.recording import Recording
 
 _STILL_S = 1.0
 _AT_REST_S = 0.1  # after which the stages of any actuator are at rest
@@ -123,23 +120,25 @@ def initial_state_after(
         DataError: The recording is unreadable or incomplete, or its commands do not fit.
         ModelError: The model has no inverse.
     """
-    followed = _Followed(path, model, sample_rate_hz)
-    commands = chain(followed.commands(), [np.array([safe])])
-    left = left_by(commands, model, sample_rate_hz, lambda: now_s - followed.ended_s)
+    ends, ended_s = read_ends(path), math.inf
+    with suppress(ValueError):  # absent in old recordings: one second is simulated
+        ended_s = _unix_s(ends.end.get("ended", ""))
+    commands = chain(_recorded_commands(path, model.input_unit, sample_rate_hz), [np.array([safe])])
+    left = left_by(commands, model, sample_rate_hz, now_s - ended_s)
     if not math.isfinite(left.stands_um):
         raise DataError(f"{path}: has commands beyond the range of the model")
-    return replace(left, run_id=followed.run_id)
+    return replace(left, run_id=ends.run.get("run_id", ""))
 
 
 def left_by(
     commands: Iterable[F64],
     model: HysteresisModel,
     sample_rate_hz: float,
-    stood_s: Callable[[], float] | None = None,
+    stood_s: float | None = None,
 ) -> InitialState:
     """Return the state of a model after commands from rest, float64[n] each, in order.
 
-    ``stood_s`` returns the time since the commands, of which at least one second is simulated;
+    ``stood_s`` is the time since the commands, of which at least one second is simulated;
     without it they must end with a rest.
     """
     forward, inverse = model.forward(sample_rate_hz), model.inverse(sample_rate_hz)
@@ -153,7 +152,7 @@ def left_by(
         if came.size > ahead:
             inverse.process(came[ahead:])
         ahead, stands_um, last = max(ahead - came.size, 0), float(came[-1]), float(command[-1])
-    if stood_s is not None and (more_s := stood_s() - _STILL_S) > 0.0:
+    if stood_s is not None and (more_s := stood_s - _STILL_S) > 0.0:
         forward.stand(more_s)
         inverse.stand(more_s)
         stands_um = float(forward.process(np.array([last]))[0])
@@ -171,52 +170,39 @@ def _and_still(commands: Iterable[F64], samples: int) -> Iterator[F64]:
         yield np.full(samples, last)
 
 
-class _Followed:
-    """The commands of a complete recorded run."""
+def _recorded_commands(path: Path, unit: str, sample_rate_hz: float) -> Iterator[F64]:
+    """Yield the commands of a complete recorded run in order, then its safe value.
 
-    def __init__(self, path: Path, model: HysteresisModel, sample_rate_hz: float) -> None:
-        self._path, self._unit, self._rate_hz = path, model.input_unit, sample_rate_hz
-        self.run_id = ""
-        self.ended_s = math.inf
-        """Unix time of its end in s, known after all commands were read."""
+    The output is constant in skipped ticks.
+    """
+    from hilctl.recording.reader import RecordingStream  # slow to import, rarely needed
 
-    def commands(self) -> Iterator[F64]:
-        """Yield the commands in order, then the safe value; skipped ticks held the output."""
-        from hilctl.recording.reader import RecordingStream  # slow to import, rarely needed
-
-        samples, held, last, whole, unanswered = 0, 0, 0.0, True, False
-        for piece in RecordingStream(self._path):
-            self._check(piece)
-            index, flags, command = piece.samples.index, piece.samples.flags, piece.samples.command
-            unanswered |= bool(np.any(flags & Flag.UNANSWERED.value))
-            if not index.size:
-                continue
-            gaps = np.diff(index, prepend=samples - 1) - 1
-            skipped = bool(np.all(flags[gaps > 0] & Flag.AFTER_SKIPPED.value))
-            whole &= skipped and (samples > 0 or index[0] == 0)
-            held += int(gaps.sum())
-            yield np.full(gaps[0], last)
-            yield np.repeat(command, 1 + np.append(gaps[1:], 0))
-            samples, last = int(index[-1]) + 1, float(command[-1])
-        if not (whole and samples and piece.end) or piece.dropped > held:
-            raise DataError(f"{self._path}: is incomplete: the state of the actuator is unknown")
-        if unanswered or piece.end.get("output_safe") == "false":
-            lost = "lost its device, or did not confirm its safe value"
-            raise DataError(f"{self._path}: {lost}: the state of the actuator is unknown")
-        if "safe_value" in piece.run:  # the guardian's, if it took over, is not a sample
-            yield np.array([float(piece.run["safe_value"])])
-        self.run_id = piece.run.get("run_id", "")
-        with suppress(ValueError):  # absent in old recordings: one second is simulated
-            self.ended_s = datetime.fromisoformat(piece.end.get("ended", "")).timestamp()
-
-    def _check(self, recording: "Recording") -> None:
-        path = self._path
-        if recording.command_unit != self._unit:
-            units = f"{recording.command_unit}, the model takes {self._unit}"
+    samples, held, last, whole, unanswered = 0, 0, 0.0, True, False
+    for piece in RecordingStream(path):
+        if piece.command_unit != unit:
+            units = f"{piece.command_unit}, the model takes {unit}"
             raise DataError(f"{path}: was recorded in {units}")
-        if recording.sample_rate_hz != self._rate_hz:
-            rates = f"{recording.sample_rate_hz:g} Hz, this run is at {self._rate_hz:g} Hz"
+        if piece.sample_rate_hz != sample_rate_hz:
+            rates = f"{piece.sample_rate_hz:g} Hz, this run is at {sample_rate_hz:g} Hz"
             raise DataError(f"{path}: was recorded at {rates}")
+        index, flags, command = piece.samples.index, piece.samples.flags, piece.samples.command
+        unanswered |= bool(np.any(flags & Flag.UNANSWERED.value))
+        if not index.size:
+            continue
+        gaps = np.diff(index, prepend=samples - 1) - 1
+        skipped = bool(np.all(flags[gaps > 0] & Flag.AFTER_SKIPPED.value))
+        whole &= skipped and (samples > 0 or index[0] == 0)
+        held += int(gaps.sum())
+        yield np.full(gaps[0], last)
+        yield np.repeat(command, 1 + np.append(gaps[1:], 0))
+        samples, last = int(index[-1]) + 1, float(command[-1])
+    if not (whole and samples and piece.end) or piece.dropped > held:
+        raise DataError(f"{path}: is incomplete: the state of the actuator is unknown")
+    if unanswered or piece.end.get("output_safe") == "false":
+        lost = "lost its device, or did not confirm its safe value"
+        raise DataError(f"{path}: {lost}: the state of the actuator is unknown")
+    if "safe_value" in piece.run:  # the guardian's, if it took over, is not a sample
+        yield np.array([float(piece.run["safe_value"])])
 
 
 _log = logging.getLogger(__name__)

@@ -28,7 +28,7 @@ from hilctl.studies.campaign.table import CampaignRow, entry_of, ordered, write_
 from hilctl.studies.multi_run.collect import COMPLETED, series_of
 from hilctl.studies.multi_run.digest import SeriesDrift, digest_of, drift_of
 from hilctl.studies.multi_run.multi_run_page import write_series
-from hilctl.studies.step_runner import StepRunner, StudyHost, raise_if_stopped
+from hilctl.studies.step_runner import StepRunner, StudyHost, raise_if_stopped, require_room
 
 HARMLESS = frozenset({"late", "dropped", "invalid_command"})
 """Codes of faults that are not the device's or the rig's: the next step may succeed."""
@@ -169,7 +169,7 @@ def run_series(plan: CampaignPlan, host: StudyHost) -> CampaignResult:
     Raises:
         InputError: No disk space, or the table can't be written; nothing has moved.
     """
-    plan.require_room()
+    require_room(plan.folder, plan.megabytes, plan.free_mb)
     state = Campaign(plan, host)
     state.keep()
     steps = _Steps(state, host)

@@ -29,7 +29,7 @@ from hilctl.studies.campaign.steps import CampaignSteps
 from hilctl.studies.campaign.store import completed_runs, new_recording
 from hilctl.studies.campaign.table import CampaignRow
 from hilctl.studies.multi_run.collect import COMPLETED
-from hilctl.studies.step_runner import StudyHost
+from hilctl.studies.step_runner import StudyHost, require_room
 
 
 @dataclass(frozen=True, slots=True)
@@ -76,7 +76,7 @@ def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
 
 def run_fast(plan: CampaignPlan, host: StudyHost, scheduler: str = "none") -> CampaignResult:
     """Run the remaining steps as fast as possible; raise InputError if the disk has no space."""
-    plan.require_room()
+    require_room(plan.folder, plan.megabytes, plan.free_mb)
     left = plan.left
     with workers(scheduler) as run:
         state = Campaign(plan, host)

@@ -11,7 +11,7 @@ from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.preflight import check
 from hilctl.run.start import RunKey
 from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, base_problem, key_of, locs_of
-from hilctl.studies.step_runner import free_mb, require_room
+from hilctl.studies.step_runner import free_mb
 
 _MOST_PROBLEMS = 20
 _LONG_AFTER_S = 1e12
@@ -66,10 +66,6 @@ class CampaignPlan:
     def megabytes(self) -> float:
         """Approximate size of the remaining recordings."""
         return sum(each.megabytes for each in self.left)
-
-    def require_room(self) -> None:
-        """Raise InputError if the disk has no room for the recordings."""
-        require_room(self.folder, self.megabytes, self.free_mb)
 
 
 def planned(

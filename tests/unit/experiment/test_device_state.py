@@ -187,7 +187,7 @@ def test_recordings_that_don_t_tell_are_refused(tmp_path, model, rate_hz, made, 
     path = record(tmp_path / "run.mcap", COMMAND, **made)
     with pytest.raises(DataError, match=message):
         state_after(path, model, rate_hz)
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(DataError, match="No such file"):
         state_after(tmp_path / "absent.mcap", model, rate_hz)
 
 

@@ -14,7 +14,6 @@ def test_what_it_takes(campaign, tmp_path):
     assert plan.seconds == pytest.approx(4 * 0.4)
     assert (plan.pauses_s, len(plan.left)) == (0.0, 4)
     assert 0.0 < plan.megabytes < 1.0
-    plan.require_room()
     assert not (tmp_path / "runs").exists()
 
 
@@ -65,10 +64,3 @@ def test_completed_steps_are_not_planned(campaign, tmp_path):
     assert [each.kept is not None for each in again.steps] == [True] + [False] * 7
     longer = campaign(CAMPAIGN + "set: {waveform.duration_s: 0.5}")
     assert len(planned(longer, tmp_path, completed, 0.0).left) == 4
-
-
-def test_no_room(campaign, tmp_path, monkeypatch):
-    plan = planned(campaign(), tmp_path, {}, 0.0)
-    object.__setattr__(plan, "free_mb", 1e-3)
-    with pytest.raises(InputError, match="no room"):
-        plan.require_room()
