@@ -8,9 +8,10 @@ Creep: every element follows its share of the displacement x by first order, T c
 y = x + c_1 + c_2 + ... Each step uses the previous x, so that the inverse is exact. Creep begins
 with the first sample, from 0.
 
-A mode is a pair of antiresonance and resonance. A mass on a damped spring follows x as in
-:func:`structure_block`; the output is (1 + 2 Z s / W + s^2 / W^2) of its position, with the
-acceleration from its spring. So the output has a share of x itself, and the inverse is exact.
+A mode is a pair of antiresonance and resonance. A mass on a damped spring follows x, which changes
+linearly between samples; the output is (1 + 2 Z s / W + s^2 / W^2) of its position, with the
+acceleration from its spring. So the output has a share of x itself, and the inverse is exact. The
+structure is a mode without an antiresonance: its output is the position.
 """
 
 import math
@@ -92,30 +93,6 @@ def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> 
         memory[0] = there + way
         memory[1] = command
         out[k] = command
-
-
-@kernel("void(float64[::1], float64[:, ::1], float64[::1], float64[::1])")
-def structure_block(x: F64, motion: F64, memory: F64, out: F64) -> None:
-    """Let a mass on a damped spring follow ``x``, which changes linearly between samples.
-
-    ``motion`` is float64[2, 4]: position and velocity after a sample, from those before it and from
-    ``x`` before and after it. ``memory`` is float64[3]: position, velocity, the previous ``x``.
-    """
-    for k in range(x.size):
-        now, before = x[k], memory[2]
-        position, velocity = memory[0], memory[1]
-        if abs(before) >= 0.0:
-            p = motion[0, 0] * position + motion[0, 1] * velocity
-            q = motion[1, 0] * position + motion[1, 1] * velocity
-            position = p + motion[0, 2] * before + motion[0, 3] * now
-            velocity = q + motion[1, 2] * before + motion[1, 3] * now
-        else:
-            position = now
-            velocity = 0.0
-        memory[0] = position
-        memory[1] = velocity
-        memory[2] = now
-        out[k] = position
 
 
 @kernel("float64(float64[::1], float64)", inline=True)

@@ -179,12 +179,8 @@ def integrated_forward(
 
     Args as for :func:`play_sum` and :func:`deadband_value`; ``v`` and ``out`` are float64[n].
     """
-    for k in range(v.size):
-        widening = _widening(v[k] - memory[thresholds.size], rate_gain)
-        _move_plays(v[k], widening, thresholds, memory)
-        x = direct * v[k] + _weigh(weights, memory)
-        memory[thresholds.size] = v[k]
-        out[k] = deadband_value(x, slope, d_up, g_up, d_down, g_down)
+    play_sum(v, rate_gain, direct, thresholds, weights, memory, out)
+    deadband_block(out, slope, d_up, g_up, d_down, g_down, out)
 
 
 @kernel(
@@ -210,12 +206,8 @@ def integrated_inverse(
     The parameters are those of the inverse operators; ``y`` and ``out`` are float64[n]. The
     previous input in ``memory`` is that of the plays, Lambda^-1(y).
     """
-    for k in range(y.size):
-        x = deadband_value(y[k], slope, d_up, g_up, d_down, g_down)
-        widening = _widening(x - memory[thresholds.size], rate_gain)
-        _move_plays(x, widening, thresholds, memory)
-        out[k] = direct * x + _weigh(weights, memory)
-        memory[thresholds.size] = x
+    deadband_block(y, slope, d_up, g_up, d_down, g_down, out)
+    play_sum(out, rate_gain, direct, thresholds, weights, memory, out)
 
 
 @kernel(

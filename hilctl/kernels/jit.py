@@ -100,9 +100,6 @@ def compiled(function: Function) -> Function:
     """Return the compiled function of a kernel: a call of it has no Python frame in between.
 
     Compiles it now, or loads it from the cache. Any other function is returned unchanged.
-
-    Raises:
-        numba.TypingError: The kernel does not match its signatures.
     """
     return function.dispatcher if isinstance(function, _Kernel) else function
 
@@ -111,9 +108,6 @@ def ensure_compiled(*kernels: object) -> None:
     """Compile kernels now, or load them from the cache, so that their first call does not wait.
 
     Objects that are no kernels are ignored.
-
-    Raises:
-        numba.TypingError: A kernel does not match its signatures.
     """
     for each in kernels:
         if isinstance(each, _Kernel):

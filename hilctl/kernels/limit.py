@@ -23,23 +23,10 @@ def limit_block(
     """Limit requested commands, float64[n], to a range and a largest change per sample.
 
     A request that is not finite is replaced by the last command. No step is larger than
-    ``max_step``. If ``previous``, the last command, lies within [low, high], every result does;
-    otherwise the results return by whole steps.
+    ``max_step`` > 0. If ``previous``, the last command, lies within [low, high], every result does;
+    otherwise the results return by whole steps. The bit of each reason is added to the flags.
 
-    Args:
-        wanted: float64[n], requested commands.
-        previous: Last command.
-        low: Lowest command.
-        high: Highest command.
-        max_step: Largest change from one sample to the next, > 0.
-        range_bit: Flag of commands limited by the range.
-        slew_bit: Flag of commands limited by the slew.
-        invalid_bit: Flag of requests that are not finite.
-        command: float64[n], filled.
-        flags: uint32[n]; bits are added.
-
-    Returns:
-        Index of the first request that is not finite, or -1.
+    Return the index of the first request that is not finite, or -1.
     """
     last = previous
     first_invalid = -1

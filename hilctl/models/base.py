@@ -60,26 +60,14 @@ class Operator:
         )
 
     def __call__(self, signal: npt.ArrayLike) -> F64:
-        """Process one block of any numbers, as :meth:`process`.
-
-        Raises:
-            ModelError: It is not a sequence of numbers.
-        """
+        """Process one block of any numbers; raise ModelError if it is not a sequence of numbers."""
         block = np.ascontiguousarray(signal, dtype=np.float64)
         if block.ndim != 1:
             raise ModelError(f"the signal must be one sequence of numbers: shape {block.shape}")
         return self.process(block)
 
     def process(self, block: F64, out: F64 | None = None) -> F64:
-        """Process one block and update the memory.
-
-        Args:
-            block: float64[n], contiguous.
-            out: float64[n] to fill; None for a new array.
-
-        Returns:
-            float64[n], the output.
-        """
+        """Process a contiguous block, float64[n], into ``out`` or a new array, and return that."""
         if out is None:
             out = np.empty_like(block)
         if self.input_offset != 0.0:

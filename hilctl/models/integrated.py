@@ -67,8 +67,7 @@ class DeadbandFunction(CheckedModel):
     def inverse(self) -> "DeadbandFunction":
         """Return Lambda^-1, of the same form: thresholds Lambda(d_j), reciprocal slopes.
 
-        Raises:
-            ModelError: Slopes differ too much for the precision of the inverse.
+        Raise ModelError if slopes differ too much for the precision of the inverse.
         """
         up, up_weights = _inverse_side(self.slope, self.up_thresholds, self.up_weights)
         down, down_weights = _inverse_side(self.slope, self.down_thresholds, self.down_weights)
@@ -165,9 +164,6 @@ def exponential_integrated(
     """Build Omega from the twelve published parameters (6.18-6.23).
 
     ``d_n`` is the spacing of the deadbands below 0 and, like ``d_p``, > 0.
-
-    Raises:
-        pydantic.ValidationError: The parameters break a condition of the model.
     """
     return IntegratedModel(
         direct=a_0,
@@ -225,10 +221,7 @@ class ButterflyModel(RateDependentPlays):
         """Return the operator from um to command, at rest, on one wing of the butterfly.
 
         The actuator is shortest where the wings meet; a displacement below that gets the command
-        of that point.
-
-        Raises:
-            ModelError: The range of the displacement is unknown or reaches below that point.
+        of that point. Raise ModelError if the range of displacement is unknown or reaches below.
         """
         turning_um = self.output_offset_um
         if self.output_range_um is None or self.output_range_um[0] < turning_um:

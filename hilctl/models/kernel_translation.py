@@ -40,8 +40,6 @@ _SIGNS: dict[type[ast.AST], str] = {
     ast.Add: "+", ast.Sub: "-", ast.Mult: "*", ast.Div: "/", ast.And: "&&", ast.Or: "||",
     ast.Lt: "<", ast.LtE: "<=", ast.Gt: ">", ast.GtE: ">=", ast.Eq: "==", ast.NotEq: "!=",
 }  # fmt: skip
-_OR, _COMPARISON, _SUM, _PRODUCT, _SIGN, _ATOM = range(6)
-"""How tightly expressions bind, in all three languages."""
 
 
 @dataclass(frozen=True)
@@ -50,8 +48,6 @@ class KernelSource:
 
     Attributes:
         name: Name of the translated function.
-        function: The Python function.
-        node: Its syntax tree.
         arguments: Types of its arguments, by name.
         returns: Type of its result.
         changed: Names of the arrays that it changes.
@@ -122,19 +118,6 @@ def _changed_by(call: ast.Call, callees: dict[str, KernelSource]) -> list[ast.Na
     return [arg for arg, name in pairs if name in changed and isinstance(arg, ast.Name)]
 
 
-def _level(node: ast.expr) -> int:
-    match node:
-        case ast.BoolOp():
-            return _OR
-        case ast.Compare(ops=[_]):  # a chain is always in brackets
-            return _COMPARISON
-        case ast.BinOp(op=op):
-            return _SUM if isinstance(op, ast.Add | ast.Sub) else _PRODUCT
-        case ast.UnaryOp():
-            return _SIGN
-    return _ATOM
-
-
 class Translator:
     """Translates kernels to C.
 
@@ -171,11 +154,7 @@ class Translator:
         self._depth = 1
 
     def add(self, kernel: Callable[..., Any]) -> KernelSource:
-        """Translate a kernel and its callees, and return its source.
-
-        Raises:
-            ModelError: Some syntax is unknown.
-        """
+        """Translate a kernel and its callees, and return its source, or raise ModelError."""
         source = source_of(kernel)
         if source.name in self.functions:
             return source
@@ -334,34 +313,34 @@ class Translator:
     def _operation(self, node: ast.expr) -> Value:
         match node:
             case ast.BinOp(left=left, op=op, right=right):
-                level = _level(node)
-                (a, one), (b, other) = self._operand(left, level), self._operand(right, level + 1)
+                (a, one), (b, other) = self._operand(left), self._operand(right)
                 kind = self._joined(node, one, other)
                 if isinstance(op, ast.FloorDiv | ast.Mod) and kind is int:
                     return self._form(type(op).__name__, a, b), int
                 if type(op) in _SIGNS and not (isinstance(op, ast.Div) and kind is int):
                     return f"{a} {_SIGNS[type(op)]} {b}", kind
             case ast.UnaryOp(op=ast.USub(), operand=operand):
-                text, kind = self._operand(operand, _SIGN)
+                text, kind = self._operand(operand)
                 return f"-{text}", kind
             case ast.UnaryOp(op=ast.Not(), operand=operand):
-                return f"{self.negation}{self._operand(operand, _ATOM)[0]}", int
+                return f"{self.negation}{self._operand(operand)[0]}", int
             case ast.BoolOp(op=op, values=values):
-                parts = [self._operand(each, _COMPARISON)[0] for each in values]
+                parts = [self._operand(each)[0] for each in values]
                 return f" {_SIGNS[type(op)]} ".join(parts), int
             case ast.Compare(left=left, ops=ops, comparators=others) if _SIGNS.keys() >= {
                 type(op) for op in ops
             }:
-                texts = [self._operand(each, _SUM)[0] for each in (left, *others)]
+                texts = [self._operand(each)[0] for each in (left, *others)]
                 signs = [_SIGNS[type(op)].replace("!", self.negation) for op in ops]
                 parts = [f"{texts[i]} {sign} {texts[i + 1]}" for i, sign in enumerate(signs)]
-                return (parts[0] if len(parts) == 1 else f"({' && '.join(parts)})"), int
+                return " && ".join(parts), int
         raise self._error(node)
 
-    def _operand(self, node: ast.expr, level: int) -> Value:
-        """Translate an operand, in brackets if it binds less than ``level``."""
+    def _operand(self, node: ast.expr) -> Value:
+        """Translate an operand, in brackets if it has an operator."""
         text, kind = self._value(node)
-        return (text if _level(node) >= level else f"({text})"), kind
+        compound = isinstance(node, ast.BinOp | ast.BoolOp | ast.Compare | ast.UnaryOp)
+        return (f"({text})" if compound else text), kind
 
     def _joined(self, node: ast.AST, *types: Type) -> Type:
         """Return the type of a value that is one of several."""

@@ -15,7 +15,6 @@ from hilctl.kernels.dynamics import (
     delay_block,
     exponential,
     mode_block,
-    structure_block,
     uncreep_block,
     unmode_block,
 )
@@ -175,7 +174,9 @@ class FirstMode(StrictModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the structure, exact for an x that changes linearly between samples."""
-        return Operator(structure_block, (self.motion(sample_rate_hz),), 2)
+        position = (1.0, 0.0, 0.0, 0.0)
+        parameters = np.array([*self.motion(sample_rate_hz).ravel(), *position])
+        return Operator(mode_block, (parameters,), 2)
 
     @property
     def radian_s(self) -> float:
@@ -183,12 +184,10 @@ class FirstMode(StrictModel):
         return 0.5 / (math.pi * self.natural_hz)
 
     def motion(self, sample_rate_hz: float) -> F64:
-        """Return float64[2, 4], see :func:`~hilctl.kernels.dynamics.structure_block`.
+        """Return motion parameters of :func:`~hilctl.kernels.dynamics.mode_block`: float64[2, 4].
 
         Velocity is in um per radian of the natural frequency, so that the matrix is well scaled.
-
-        Raises:
-            ModelError: The natural frequency is too low for the sample rate.
+        Raise ModelError if the natural frequency is too low for the sample rate.
         """
         rates = np.zeros((4, 4))  # position, velocity, x, its change over the step
         rates[0, 1] = 1.0
@@ -232,8 +231,7 @@ class FurtherMode(StrictModel):
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the pair, exact for an x that changes linearly between samples.
 
-        Raises:
-            ModelError: A frequency is too low for the sample rate.
+        Raise ModelError if a frequency is too low for the sample rate.
         """
         return Operator(mode_block, (self._parameters(sample_rate_hz),), 2)
 

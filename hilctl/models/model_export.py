@@ -22,17 +22,10 @@ _WIDTH = 96
 def export_text(
     model: HysteresisModel, output: Path, sample_rate_hz: float, *, forward: bool = False
 ) -> str:
-    """Return the text of a file with a function of its name, whose state is an array.
+    """Return the text of a ``.c`` or ``.m`` file with a function of its name and state.
 
-    Args:
-        model: The model.
-        output: Name of the file; ``.c`` or ``.m`` selects the language.
-        sample_rate_hz: Samples per second.
-        forward: Export the model instead of its inverse.
-
-    Raises:
-        InputError: The name of the file or the sample rate is invalid.
-        ModelError: The model has no inverse at this sample rate.
+    It is the inverse, or the model if ``forward``. Raise InputError if the name of the file or the
+    sample rate is invalid, ModelError if the model has no inverse at this rate.
     """
     form = {".c": _CFile, ".m": _MatlabFile}.get(output.suffix)
     problems = []

@@ -20,12 +20,7 @@ class ModelFile(StrictModel):
 
 
 def load_model(path: Path, files: TextFiles | None = None) -> HysteresisModel:
-    """Read a model file.
-
-    Raises:
-        InputError: The file cannot be read.
-        ConfigError: It breaks a rule or has no inverse; all problems are listed.
-    """
+    """Read a model file; raise InputError if it is not readable, ConfigError with broken rules."""
     return load_document(path, files).validate(ModelFile).model
 
 

@@ -139,10 +139,7 @@ class SpiModel(PlayModel):
         """Return w_0, w_1 to w_n and s_1 to s_n, both float64[n] (3.18, 3.19, 3.24).
 
         The thresholds are the PPI's initial loading curve at its own thresholds. The weights solve
-        ``sum_j min(s_i, s_j) w_j + s_i w_0 = r_i``.
-
-        Raises:
-            ModelError: The numbers of the inverse are not finite.
+        ``sum_j min(s_i, s_j) w_j + s_i w_0 = r_i``. Raise ModelError as :func:`inverse_plays`.
         """
         # In closed form from the inverse plays: the last bits of a linear solver depend on the
         # processor, but a recording must replay to the same bits on all.

@@ -250,8 +250,7 @@ class RefinedModel(HysteresisModel):
     def inverse(self, sample_rate_hz: float) -> Chain:
         """Return the operator from displacement in um, ``preview`` samples ahead, to command.
 
-        Raises:
-            ModelError: The inverse of the base is not finite.
+        Raise ModelError as the inverse of the base does.
         """
         operator = self.residual.inverse(sample_rate_hz, rest_um(self.base))
         inverse = self.base.inverse(sample_rate_hz)

@@ -136,9 +136,7 @@ class StagedModel(HysteresisModel):
     def inverse(self, sample_rate_hz: float) -> Chain:
         """Return the operator from displacement in um, ``preview`` samples ahead, to command.
 
-        Raises:
-            ModelError: The inverse of the hysteresis is not finite, or that of a mode is unstable
-                at this sample rate.
+        Raise ModelError as the inverses of the hysteresis and of the modes do.
         """
         whole, part = self._delay(sample_rate_hz)
         preview = 1 + whole + (1 if part else 0)

@@ -21,9 +21,7 @@ from hilctl.models.linear_stages import FirstMode, FurtherMode, smoothing_weight
 
 RATE_HZ = 20_000.0
 SIGNAL = 2.0 * np.sin(np.arange(400) / 9.0) + 0.6 * np.cos(np.arange(400) / 2.3)
-MOTION = FirstMode(natural_hz=1500.0, damping_ratio=0.1).motion(RATE_HZ)
-
-
+STRUCTURE = FirstMode(natural_hz=1500.0, damping_ratio=0.1).forward(RATE_HZ).parameters[0]
 LEFT, GAIN = np.array([0.5, 0.9, 0.999]), np.array([0.02, 0.004, 3e-5])
 PARAMETERS = np.concatenate((LEFT, GAIN))
 PAIR = FurtherMode(
@@ -35,7 +33,7 @@ STREAMING = {
     "linear lag": (dynamics.lag_block, (0.3, 0.0), 1),
     "lead": (dynamics.lead_block, (0.3, 0.4), 1),
     "linear lead": (dynamics.lead_block, (0.3, 0.0), 1),
-    "structure": (dynamics.structure_block, (MOTION,), 2),
+    "structure": (mode_block, (STRUCTURE,), 2),
     "weigh": (dynamics.weigh_block, (smoothing_weights(1.5, 0.3, 5.0)[0],), 10),
     "delay": (dynamics.delay_block, (), 4),
     "between": (dynamics.between_block, (0.3,), 0),
@@ -142,7 +140,7 @@ def test_structure_is_the_exact_solution():
     signal = SIGNAL - SIGNAL[0]
     _, expected, _ = lsim(system, signal, np.arange(signal.size) / RATE_HZ)
     out = np.empty_like(signal)
-    dynamics.structure_block(signal, MOTION, rest_memory(2), out)
+    mode_block(signal, STRUCTURE, rest_memory(2), out)
     np.testing.assert_allclose(out, expected, atol=1e-9)
 
 
@@ -168,7 +166,7 @@ def test_the_first_weight_is_of_the_oldest_value():
 
 def test_a_structure_begins_at_rest_whatever_its_memory_held():
     out = np.empty(50)
-    dynamics.structure_block(np.full(50, 2.0), MOTION, np.array([9.0, 9.0, np.nan]), out)
+    mode_block(np.full(50, 2.0), STRUCTURE, np.array([9.0, 9.0, np.nan]), out)
     np.testing.assert_allclose(out, 2.0, rtol=1e-12)
 
 
