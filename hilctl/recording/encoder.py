@@ -7,6 +7,7 @@ from typing import NamedTuple, Self
 
 import numpy as np
 from mcap.writer import Writer
+from pydantic import TypeAdapter, ValidationError
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
@@ -18,6 +19,7 @@ from hilctl.base.samples import (
     SampleColumn,
     Samples,
 )
+from hilctl.base.strict import first_problem
 from hilctl.base.types import F64, I64, U32, CommandUnit
 from hilctl.recording import schema
 from hilctl.recording.codec import BlockArrays, encode_block, encode_scope, encode_ticks
@@ -110,26 +112,14 @@ class RecordingLayout:
 
     @classmethod
     def from_facts(cls, facts: Mapping[str, str]) -> Self:
-        """Return the layout from the facts of a recording.
-
-        Raises:
-            DataError: A fact is missing (as in recordings of older versions) or damaged.
-        """
+        """Return the layout in a recording's facts; raise DataError if these are incomplete."""
         try:
-            return cls(
-                sample_rate_hz=float(facts["sample_rate_hz"]),
-                command_unit="V" if facts["command_unit"] == "V" else "A",
-                measures_command=facts["measures_command"] == "true",
-                scope_rate_hz=float(facts["scope_rate_hz"]),
-                start_unix_ns=int(facts["start_unix_ns"]),
-                # Older recordings do not have these.
-                records_input=facts.get("records_input") == "true",
-                waveform_unit=facts.get("waveform_unit", "um"),
-                ages_readings=facts.get("ages_readings") == "true",
-                corrects_readings=facts.get("corrects_readings") == "true",
-            )
-        except (KeyError, ValueError, InputError) as error:
-            raise DataError(f"metadata hilctl.run: missing or damaged: {error}") from None
+            return TypeAdapter(cls).validate_strings(facts)
+        except ValidationError as error:
+            problem = first_problem(error)
+        except InputError as error:
+            problem = str(error)
+        raise DataError(f"metadata hilctl.run: missing or damaged: {problem}")
 
 
 def event_message(event: Event, before: Iterable[tuple[RecordedField, F64]] = ()) -> Encoded:

@@ -58,8 +58,6 @@ class Recording:
         end: Facts from its end (counters, reason); empty if the file is truncated.
         compensated: Whether a compensator computed the command from the reference.
         dropped: Samples that were exchanged or due but are missing.
-        ticks: Timing of every tick.
-        events: Events in order.
         model_yaml: The compensator's model, or empty.
         starts: Possible starts of a replay.
         correction_yaml: The learned correction that was added to the reference, or empty.

@@ -13,8 +13,7 @@ from hilctl.base.private_dirs import is_locked, take_lock
 def lock(stream: BinaryIO, *, shared: bool = False) -> None:
     """Mark a recording as being written, or as being recovered (shared), until it is closed.
 
-    Raises:
-        BlockingIOError: Another process is writing it.
+    Raise BlockingIOError if another process is writing it.
     """
     try:
         take_lock(stream, shared=shared)
@@ -34,9 +33,7 @@ def is_being_recorded(stream: BinaryIO | FileIO) -> bool:
 class Replacement:
     """A new file for the place of an old one; :meth:`close` without :meth:`put` removes it.
 
-    Raises:
-        FileExistsError: ``output`` exists.
-        OSError: The folder cannot be written.
+    Raise FileExistsError if ``output`` exists, OSError if the folder cannot be written.
     """
 
     def __init__(self, path: Path, output: Path | None) -> None:

@@ -45,11 +45,7 @@ def recordings_in(folder: Path) -> list[Path]:
 
 
 def read_ends(path: Path) -> RunSummary:
-    """Read the facts of a run from the start and the end of its recording.
-
-    Raises:
-        DataError: The file cannot be read, is not an MCAP file, or does not begin with a run.
-    """
+    """Read the facts of a run from both ends of its recording; raise DataError if it has none."""
     try:
         if stat.S_ISREG(path.stat().st_mode):  # first: opening a pipe waits for its writer
             with path.open("rb", _BUFFER_BYTES) as stream:

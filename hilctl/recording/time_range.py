@@ -43,24 +43,18 @@ class TimeRange:
         return start, stop
 
     def cut(self, recording: Recording) -> Recording:
-        """Return the part of a recording in this range, with all events.
+        """Return the part of a recording in this range, with all events; raise DataError if empty.
 
         Segments are cut to the range, counters of the whole run are omitted, and missing samples
         are counted between the first and the last sample of the part.
-
-        Raises:
-            DataError: The recording has no sample in this range.
         """
         (whole,) = self.cut_pieces([recording])
         return whole
 
     def cut_pieces(self, pieces: Iterable[Recording]) -> Iterator[Recording]:
-        """Cut the pieces of a :class:`hilctl.recording.reader.RecordingStream`.
+        """Cut the pieces of a recording; raise DataError if no piece has a sample in this range.
 
         The last piece has the counters, and segments that end with its last sample.
-
-        Raises:
-            DataError: No piece has a sample in this range.
         """
         held: Recording | None = None
         read = found = first = end = 0
@@ -124,9 +118,6 @@ def places_of(stream: BinaryIO, time_range: TimeRange) -> list[int] | None:
     """Return the sorted offsets of the records of a time range; None without a valid index.
 
     These are chunks with its samples, ticks or any events, and all metadata and attachments.
-
-    Raises:
-        DataError: A time is not a finite number.
     """
     summary = _summary(stream)
     chunks = [record for record in summary if isinstance(record, ChunkIndex)]

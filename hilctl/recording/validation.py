@@ -4,17 +4,16 @@ A check of a message returns the problem, or an empty text. The reader rejects t
 omits the message.
 """
 
-import json
 import math
 from collections.abc import Callable, Mapping
 from functools import cache
-from typing import Annotated, Any
+from typing import Any
 
 import numpy as np
 import numpy.typing as npt
 from google.protobuf.message import DecodeError
 from mcap.records import Channel, McapRecord, Message, Schema
-from pydantic import Field, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from hilctl.base.device import AuxChannel
 from hilctl.base.errors import DataError, InputError
@@ -42,10 +41,13 @@ RATES_HZ = (1e-6, 1e9)
 
 _MOST_VALUES = 1000
 _MOST_TEXT = 2**24
-_Index = Annotated[int, Field(ge=0, lt=LAST_SAMPLE)]
 _UNITS: tuple[CommandUnit, ...] = ("A", "V")
 _MOST_DIGITS = 15
 _LINE = 60
+_STRICT = StrictModel.model_config
+_LABELS = TypeAdapter(dict[str, LabelValue], config=_STRICT)
+_AUX = TypeAdapter(tuple[AuxChannel, ...])
+_SEGMENTS = TypeAdapter(tuple[Segment, ...], config=_STRICT)
 
 
 _DECODERS: dict[str, Callable[[bytes], Any]] = {
@@ -229,21 +231,10 @@ def labels_of(facts: Mapping[str, str]) -> dict[str, LabelValue]:
     """Return the labels of a run, if any; raise ValueError unless texts and finite numbers."""
     text = facts.get(LABELS_FACT, "{}")
     try:
-        labels = json.loads(text)
-    except (ValueError, RecursionError):
-        labels = None
-    if not isinstance(labels, dict) or not all(map(_is_label, labels.values())):
-        raise ValueError(f"{LABELS_FACT} must be texts and numbers by name, got {short(text)}")
-    return labels
-
-
-def _is_label(value: object) -> bool:
-    if isinstance(value, int | float):
-        return not isinstance(value, bool) and abs(value) < math.inf
-    return isinstance(value, str)
-
-
-_AUX = TypeAdapter(tuple[AuxChannel, ...])
+        return _LABELS.validate_json(text)
+    except ValidationError:
+        rule = f"{LABELS_FACT} must be texts and numbers by name"
+        raise ValueError(f"{rule}, got {short(text)}") from None
 
 
 def aux_channels_of(facts: Mapping[str, str]) -> tuple[AuxChannel, ...]:
@@ -283,41 +274,21 @@ def short(text: str) -> str:
     return repr(text if len(text) <= _LINE else text[: _LINE - 3] + "...")
 
 
-class _RecordedSegment(StrictModel):
-    """Fields of a recorded :class:`~hilctl.base.segments.Segment`."""
-
-    label: str
-    start: _Index
-    stop: _Index
-    steady_start: _Index
-    steady_stop: _Index
-    period: Annotated[float, Field(ge=0.0, allow_inf_nan=False)] = 0.0
-
-
-_SEGMENTS = TypeAdapter(list[_RecordedSegment])
-
-
 def segments_of(text: str) -> tuple[Segment, ...]:
-    """Return the segments of a run from their JSON text.
-
-    Raises:
-        ValueError: They are not the output of :meth:`~hilctl.base.segments.Segment.to_mapping`, not
-            in order, or have an impossible steady part or period.
-    """
+    """Return the segments of a run from their JSON text; raise ValueError if they are invalid."""
     if len(text) > _MOST_TEXT:
         raise ValueError(f"segments: {len(text)} characters are more than any run has")
     try:
-        recorded = _SEGMENTS.validate_json(text)
+        segments = _SEGMENTS.validate_json(text)
     except ValidationError as error:
         raise ValueError(f"segments: {first_problem(error, 'the text')}") from None
-    segments = tuple(Segment(**each.model_dump()) for each in recorded)
     end = 0
     for number, each in enumerate(segments):
-        places = [end, each.start, each.steady_start, each.steady_stop, each.stop]
+        places = [end, each.start, each.steady_start, each.steady_stop, each.stop, LAST_SAMPLE - 1]
         if places != sorted(places):
             rule = "its samples must follow those before it and rise"
             raise ValueError(f"segments: {number}: {rule}: {places}")
-        if 0.0 < each.period < SHORTEST_PERIOD:
+        if each.period and each.period < SHORTEST_PERIOD:
             raise ValueError(f"segments: {number}: a period of {each.period!r} samples can't be")
         end = each.stop
     return segments
