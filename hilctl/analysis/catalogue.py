@@ -165,8 +165,7 @@ def _to_sql(value: Any) -> Any:
 def read_catalogue(folder: Path) -> list[Entry]:
     """Return the entries of all ``.mcap`` files in a folder, at any depth, sorted by path.
 
-    Raises:
-        InputError: It is not a folder, or cannot be listed.
+    Raise InputError if it is not a folder, or cannot be listed.
     """
     try:
         folder = folder.resolve()

@@ -40,7 +40,7 @@ _ADVICE = {
 def export(
     recording: Recording | Iterable[Recording], path: Path, *, overwrite: bool = False
 ) -> int:
-    """Write samples atomically to a file in the format of its suffix.
+    """Write samples atomically to a file in the format of its suffix; return their number.
 
     Columns are ``sample``, ``t_s`` (since the start of the run), those of
     :class:`hilctl.base.samples.Samples` under their recorded names, auxiliary channels and
@@ -52,9 +52,6 @@ def export(
             (:class:`hilctl.recording.reader.RecordingStream`).
         path: File to write: ``.csv``, ``.npz``, ``.parquet`` or ``.mat``.
         overwrite: Replace a file of that name.
-
-    Returns:
-        Number of samples written.
 
     Raises:
         InputError: Unknown suffix, the file exists, cannot be written or cannot hold as many
@@ -181,13 +178,8 @@ def export_all(
     channels, which differ from run to run, are omitted. Files are written atomically and never
     replaced; another call continues an interrupted export.
 
-    Args:
-        folder: Folder with recordings, at any depth.
-        output: Folder to write to; created if missing.
-        on_progress: Called with the completed share and the next recording.
-
-    Raises:
-        InputError: The folder cannot be listed, a file cannot be written, or pyarrow is missing.
+    ``on_progress`` gets the completed share and the next recording. Raise InputError if the folder
+    cannot be listed, a file cannot be written, or pyarrow is missing.
     """
     arrow()  # fails before any work is done
     entries = read_catalogue(folder)

@@ -169,8 +169,7 @@ def write_figure(
 ) -> list[Path]:
     """Write a figure atomically as ``NAME.FORMAT`` in several formats; return the files.
 
-    Raises:
-        InputError: A file exists and may not be replaced, or cannot be written.
+    Raise InputError if a file exists and may not be replaced, or cannot be written.
     """
     written = []
     for chosen in formats:

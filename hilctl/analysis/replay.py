@@ -88,14 +88,10 @@ class ReplayResult:
     """Comparison of recomputed and recorded commands.
 
     Attributes:
-        samples: Recomputed samples.
         left_out_samples: Samples after damage of the file, with unknown compensator memory.
         identical: Whether every wanted command, command and flag has the same bits.
         first_difference: Index of the first sample that differs, or None.
         largest_difference: Largest magnitude of a difference between commands.
-        command_unit: ``A`` or ``V``.
-        command_min: Lowest recomputed command.
-        command_max: Highest recomputed command.
         limited_samples: Recomputed samples that the limiter changed.
         predicted: Predicted error of another model; None for the recorded model.
     """

@@ -61,14 +61,11 @@ def build_report(
     pieces: Iterable[Recording],
     observe: Callable[[Windows], Callable[[Recording], None]] | None = None,
 ) -> "RunReportBuilder":
-    """Return the builder of a report after the last piece.
+    """Return the builder of a report after the last piece; raise DataError without any piece.
 
     The pieces are read again if the evaluated samples turn out to differ from the planned ones.
     ``observe`` is called with the evaluated samples before each reading; it returns a function
     that is called with each piece.
-
-    Raises:
-        DataError: There is no piece.
     """
     windows: Windows | None = None
     while True:

@@ -26,7 +26,6 @@ class RunMetrics:
             input, over the peak-to-peak displacement (figure 2.4).
         noise_floor_percent: Peak hysteresis that sensor noise alone would cause.
         loop_area: Area enclosed by the loop, in um times the input's unit.
-        peak_to_peak_um: Peak-to-peak displacement.
         peak_error_percent: Largest displacement less reference, offset included, over the
             peak-to-peak reference; the raw error without a period.
         rms_error_percent: Its root mean square.
@@ -55,7 +54,6 @@ class SegmentReport(RunMetrics):
     """Metrics of one segment.
 
     Attributes:
-        label: Its waveform.
         start_s: Time of its first sample since the start of the run.
         frequency_hz: Frequency of its period; None without one.
         samples: Recorded samples in it, soft start and end included.
@@ -77,7 +75,6 @@ class RunReport(RunMetrics):
     samples are summed; extremes include all recorded samples.
 
     Attributes:
-        path: File that was read.
         reason: Why the run ended, or that the recording is truncated.
         complete: Whether its end is recorded, and its last sample is recorded or counted as
             dropped.

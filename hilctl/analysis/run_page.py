@@ -33,12 +33,9 @@ _USUAL = {"0.0", "None", ""}
 def write_html(
     recording: Recording, report: RunReport, path: Path, before: Recording | None = None
 ) -> None:
-    """Write the page of a run; an existing file is replaced.
+    """Write the page of a run over an existing file; raise InputError if it cannot be written.
 
     ``before`` is the same motion without a compensator, for comparison.
-
-    Raises:
-        InputError: It cannot be written.
     """
     html.write_page(page(recording, report, before), path)
 

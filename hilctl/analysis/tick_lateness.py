@@ -122,8 +122,7 @@ def tick_period_ns(ticks: Ticks) -> float | None:
 def misses(recording: Recording, ticks: int) -> str:
     """Return a text on the share of skipped ticks; empty if there are none or it is unknown.
 
-    Raises:
-        DataError: A recorded number is invalid.
+    Raise DataError if a recorded number is invalid.
     """
     skipped = counter(recording, "skipped_ticks") or 0
     text = recording.run.get("max_missed_share", repr(USUAL_MISSED_SHARE))

@@ -84,8 +84,7 @@ class SensorCalibration(CalibrationOrigin):
     def curve(self, low_um: float, high_um: float) -> tuple[F64, F64]:
         """Return the points of the curve for a sensor that reads from ``low_um`` to ``high_um``.
 
-        Raises:
-            InputError: The sensor reads nothing in the calibrated range.
+        Raise InputError if the sensor reads nothing in the calibrated range.
         """
         low, high = max(low_um, self.range_um[0]), min(high_um, self.range_um[1])
         if not low < high:

@@ -30,11 +30,7 @@ class TextFiles:
         self.texts: dict[str, str] = dict(texts or {})
 
     def read(self, path: Path) -> str:
-        """Return a file's text.
-
-        Raises:
-            InputError: The file cannot be read, is not UTF-8 text, or was not read before.
-        """
+        """Return a file's text; raise InputError if it is not UTF-8, or was not read before."""
         key = os.path.abspath(path)  # noqa: PTH100  a link stays the link that was named
         if key not in self.texts:
             if self._sealed:
@@ -56,11 +52,7 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def read_bytes(path: Path, max_bytes: int) -> bytes:
-    """Return the content of a file.
-
-    Raises:
-        InputError: The file cannot be read, or is too large (checked before reading).
-    """
+    """Return the content of a file; raise InputError if it cannot be read, or is too large."""
     try:
         if path.exists() and not path.is_file():
             raise InputError(f"{path}: is not a file")
@@ -214,11 +206,7 @@ def write_text(path: Path, text: str, *, overwrite: bool) -> None:
 
 
 def check_writable(path: Path, *, overwrite: bool, inputs: Iterable[Path] = ()) -> None:
-    """Reject a file that cannot be written, before the work for it starts.
-
-    Raises:
-        InputError: It is one of the inputs, or :func:`write_file` would fail now.
-    """
+    """Raise InputError if :func:`write_file` would fail now, or a file is one of the inputs."""
     check_no_input(path, inputs)
     with _written(path, overwrite=overwrite):
         pass  # not committed, so discarded

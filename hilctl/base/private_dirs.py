@@ -41,9 +41,8 @@ def user_folders() -> list[Path]:
 def private_folder(path: Path, *, make: bool = True) -> Path:
     """Return a folder, created if ``make``, after checking its owner and permissions.
 
-    Raises:
-        OSError: It cannot be created, is a link or no folder, belongs to another user, or is
-            writable by others. Its parent is trusted.
+    Raise OSError if it cannot be created, is a link or no folder, belongs to another user, or is
+    writable by others. Its parent is trusted.
     """
     if make:
         with suppress(FileExistsError):
@@ -72,9 +71,7 @@ HAS_LOCKS = fcntl is not None
 def take_lock(held: int | IO[bytes], *, shared: bool = False) -> None:
     """Lock an open file or folder until it is closed; does nothing without system support.
 
-    Raises:
-        BlockingIOError: Another process holds the lock.
-        OSError: The file system has no locks.
+    Raise BlockingIOError if another process holds the lock, OSError if there are no locks.
     """
     if fcntl is not None:
         fcntl.flock(held, (fcntl.LOCK_SH if shared else fcntl.LOCK_EX) | fcntl.LOCK_NB)

@@ -35,14 +35,11 @@ class Segment:
         return replace(self, **{name: getattr(self, name) + samples for name in names})
 
     def steady_cycles(self) -> tuple[int, int, int]:
-        """Return the complete steady cycles for metrics.
+        """Return the complete steady cycles for metrics: first sample, after the last, number.
 
         They end with the steady part. The first cycle after the soft start is excluded, because
         hysteresis depends on its start until it has reached both ends; if none remains, the last
         complete cycle is used, and without one the count is 0.
-
-        Returns:
-            First sample, sample after the last, number of whole cycles.
         """
         if self.period <= 0.0:
             return self.steady_start, self.steady_stop, 0

@@ -37,36 +37,27 @@ _LATE = 1.0  # largest departure of a sample from an even grid, in steps
 _IN_BRACKETS = re.compile(r"(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]")
 _SUFFIX = re.compile(r".*_(?P<unit>s|ms|us|V|mV|A|mA|um|nm|mm)", re.IGNORECASE)
 _SCALES: dict[str, dict[str, float]] = {
-    "s": {"s": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0, "sec": 1.0},
-    "um": {"um": 1.0, "nm": 1e-3, "mm": 1e3, "m": 1e6, "micron": 1.0, "microns": 1.0},
-    "A": {"A": 1.0, "mA": 1e-3, "amp": 1.0, "ampere": 1.0},
-    "V": {"V": 1.0, "mV": 1e-3, "kV": 1e3, "volt": 1.0},
+    "s": {"s sec second seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
+    "um": {"um micron microns micrometer": 1.0, "nm": 1e-3, "mm": 1e3, "m": 1e6},
+    "A": {"A amp amps ampere amperes": 1.0, "mA": 1e-3},
+    "V": {"V volt volts": 1.0, "mV": 1e-3, "kV": 1e3},
 }
-"""Units of each base unit, with their factors to it."""
-_WORDS = {
-    "second": "s",
-    "seconds": "s",
-    "volts": "V",
-    "amps": "A",
-    "amperes": "A",
-    "micrometer": "um",
+"""Names of the units of each base unit, with their factors to it."""
+_UNITS = {
+    name: (base, factor)
+    for base, scales in _SCALES.items()
+    for names, factor in scales.items()
+    for name in names.split()
 }
 _OTHERS = {"", "-", "%", "hz", "n", "c", "°c", "k", "counts", "count", "bit", "deg", "sequence"}
+_IN_ANY_CASE = {name.lower(): unit for name, unit in _UNITS.items() if name not in {"mA", "m"}}
+_IN_ANY_CASE |= dict.fromkeys(_OTHERS, ("", 1.0))
 
 
 def known_unit(text: str) -> tuple[str, float] | None:
-    """Return the base unit (s, um, A, V; empty for others) and factor of a unit, or None.
-
-    Args:
-        text: The unit as written, in brackets or not.
-    """
+    """Return the base unit (s, um, A, V; empty for others) and factor of a unit, or None."""
     bare = text.strip(" []()").replace("µ", "u").replace("μ", "u")
-    bare = _WORDS.get(bare.lower(), bare)
-    for base, scales in _SCALES.items():
-        for unit, factor in scales.items():
-            if bare == unit or (bare.lower() == unit.lower() and unit not in {"mA", "m"}):
-                return base, factor
-    return ("", 1.0) if bare.lower() in _OTHERS else None
+    return _UNITS.get(bare) or _IN_ANY_CASE.get(bare.lower())
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,15 +75,10 @@ class TableRows:
     lines: npt.NDArray[np.int64]
 
     def sample_rate_hz(self, time: int, tolerance: float, factor: float = 1.0) -> float:
-        """Return the sample rate from a time column, which must be evenly spaced.
+        """Return the sample rate from column ``time``, in ``factor`` s.
 
-        Args:
-            time: Index of the column in ``values``.
-            tolerance: Largest deviation of a step from the median, relative to it.
-            factor: Seconds per unit of the column.
-
-        Raises:
-            DataError: Time does not rise, or not evenly; names the line.
+        No step may differ from the median by more than ``tolerance``, relative to it. Raise
+        DataError with the line if time does not rise, or not evenly.
         """
         time_s: F64 = self.values[time] * factor
         steps = np.diff(time_s)
@@ -122,15 +108,9 @@ class TableRows:
 
 
 class Table(ABC):
-    """Columns of numbers.
-
-    Args:
-        path: The file.
-        names: Names of the columns, or their numbers from 1.
-        units: Unit of each column as written; empty if there are none.
+    """Columns of numbers in a file.
 
     Attributes:
-        path: The file.
         names: Names of the columns, or their numbers from 1.
     """
 
@@ -140,14 +120,9 @@ class Table(ABC):
         self._units = list(units) or [_unit_in(name) for name in names]
 
     def index(self, column: Column | None) -> int:
-        """Return a column's index from 0.
+        """Return the index from 0 of a column; None is the only one.
 
-        Args:
-            column: Its name, with or without a unit in brackets, or its number from 1; None for
-                the only one.
-
-        Raises:
-            DataError: The column does not exist or is ambiguous.
+        A name may omit a unit in brackets. Raise DataError if it names no or several columns.
         """
         names = self.names
         if column is None:
@@ -189,25 +164,14 @@ class Table(ABC):
     def read(
         self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None
     ) -> TableRows:
-        """Read some columns of some rows.
+        """Read some columns, by their indices from 0, of some rows, counted from 1; None for all.
 
-        Args:
-            columns: Their indices from 0.
-            first_row: First row, counted from 1.
-            last_row: Last row; None for all.
-
-        Raises:
-            DataError: Rows are missing, or a value is not a finite number; names the row.
+        Raise DataError if rows are missing or, with the row, if a value is not a finite number.
         """
 
 
 class ArrayTable(Table):
-    """Columns in memory.
-
-    Args:
-        path: The file.
-        columns: Arrays of one length by name.
-    """
+    """Columns in memory, arrays of one length by name."""
 
     def __init__(self, path: Path, columns: dict[str, npt.NDArray[np.generic]]) -> None:
         super().__init__(path, list(columns))
@@ -231,17 +195,7 @@ class ArrayTable(Table):
 
 
 def check_rows(path: Path, count: int, first_row: int, last_row: int | None) -> None:
-    """Reject rows that do not exist.
-
-    Args:
-        path: The file, for the message.
-        count: Number of rows.
-        first_row: First row requested, counted from 1.
-        last_row: Last row requested; None for the last of the file.
-
-    Raises:
-        DataError: A row does not exist, or the last is before the first.
-    """
+    """Raise DataError unless all rows, counted from 1, exist; ``last_row`` None is the last."""
     if not 1 <= first_row <= (count if last_row is None else last_row) <= count:
         last = "the last" if last_row is None else last_row
         raise DataError(f"{path}: has {count} rows: rows {first_row} to {last} are not all there")
@@ -263,13 +217,8 @@ _DECIMAL_COMMA = re.compile(r"[+-]?\d*,?\d+(e[+-]?\d+)?", re.IGNORECASE)
 class TextTable(Table):
     """A text table with its columns and rows read on request.
 
-    Args:
-        path: The file.
-        skip_rows: Lines at the start of the file to skip.
-
-    Raises:
-        InputError: The file cannot be read, or is too large.
-        DataError: It has no rows of numbers.
+    ``skip_rows`` lines at its start are skipped. Raise InputError if it cannot be read or is too
+    large, DataError if it has no rows of numbers.
     """
 
     def __init__(self, path: Path, skip_rows: int = 0) -> None:
@@ -328,8 +277,7 @@ class TextTable(Table):
     ) -> TableRows:
         """Read some columns of some rows, see :meth:`Table.read`; other cells may have any content.
 
-        Raises:
-            DataError: Also if a row is longer or shorter than the others; names the line.
+        Raise DataError, with the line, also if a row is longer or shorter than the others.
         """
         check_rows(self.path, len(self._rows), first_row, last_row)
         rows = self._rows[first_row - 1 : last_row]
@@ -435,11 +383,9 @@ _Columns = dict[str, npt.NDArray[Any]]
 
 
 def open_table(path: Path, skip_rows: int = 0) -> Table:
-    """Open a table.
+    """Open a table: ``.npy``, ``.npz``, ``.mat``, ``.parquet``, or text.
 
-    Args:
-        path: ``.npy``, ``.npz``, ``.mat``, ``.parquet``, or a text table.
-        skip_rows: Lines at the start of a text table to skip.
+    ``skip_rows`` is the number of lines to skip at the start of a text table.
 
     Raises:
         InputError: The file cannot be read, or holds no columns of numbers.

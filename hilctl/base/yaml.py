@@ -382,8 +382,7 @@ def _scalar(node: yaml.Node) -> Any:
 def dump(data: Any) -> str:
     """Return plain data as YAML; reading it gives the same data, lists as tuples.
 
-    Raises:
-        yaml.YAMLError: The data contain other types, or whole numbers of more than 64 bits.
+    Raise yaml.YAMLError for other types, and for whole numbers of more than 64 bits.
     """
     return yaml.dump(data, Dumper=_PlainDumper, sort_keys=False, width=100)
 
@@ -537,10 +536,7 @@ class Document:
     ) -> Model:
         """Build a pydantic model from the document or its part ``at``, except the keys ``without``.
 
-        ``context`` is for the validators.
-
-        Raises:
-            ConfigError: One or more rules are broken; all are listed.
+        ``context`` is for the validators. Raise ConfigError with all broken rules.
         """
         data = self.value(at)
         if without:
@@ -552,12 +548,7 @@ class Document:
 
 
 def load_document(path: Path, files: TextFiles | None = None) -> Document:
-    """Read a YAML file.
-
-    Raises:
-        InputError: The file cannot be read.
-        ConfigError: See :class:`Document`.
-    """
+    """Read a YAML file; raise InputError if it cannot be read, or as :class:`Document` does."""
     return Document(str(path), (files or TextFiles()).read(path))
 
 

@@ -55,8 +55,7 @@ def waveforms_of(
 ) -> list[AnyWaveform]:
     """Return a waveform at each frequency, with the necessary duration.
 
-    Raises:
-        InputError: Another waveform with frequencies, or a frequency is not > 0.
+    Raise InputError for another waveform with frequencies, and for a frequency that is not > 0.
     """
     if frequencies_hz is None:
         return [waveform]
@@ -90,8 +89,7 @@ def full_stroke(loops: Sequence[SteadyLoop]) -> Sine:
 class TrialDevice:
     """A simulated device with the limits of its experiment, for trials.
 
-    Raises:
-        InputError: The device is not simulated, or a waveform is invalid or not periodic.
+    Raise InputError if it is not simulated, or a waveform is invalid or not periodic.
     """
 
     def __init__(self, loaded: LoadedExperiment, waveforms: Sequence[AnyWaveform]) -> None:

@@ -210,8 +210,7 @@ def _disk_room(recording: Path) -> dict[str, int] | None:
 class RunList:
     """Readers of the active runs, each created when it is first requested.
 
-    Args:
-        chosen: Returns the run to show if none is named; None if there is none.
+    ``chosen`` returns the run to show if none is named.
     """
 
     def __init__(self, chosen: Callable[[list[RunFolder]], RunFolder | None]) -> None:

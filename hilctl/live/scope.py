@@ -105,12 +105,8 @@ class MinMaxTrace:
     """Newest buckets of a run, with minimum, maximum and first value of each signal.
 
     The range of each bucket is drawn, so an outlier is visible in an hour as well as in a second.
-
-    Args:
-        origin: First sample of bucket 0.
-        width: Samples per bucket, >= 1, may be fractional.
-        keep: Number of stored buckets.
-        signals: Number of signals.
+    Bucket 0 begins at sample ``origin``; ``width`` is the samples per bucket, >= 1, may be
+    fractional; ``keep`` is the number of stored buckets.
     """
 
     def __init__(self, origin: float, width: float, keep: int, signals: int = len(SIGNALS)) -> None:
@@ -156,7 +152,6 @@ class ScopeWindow:
     Attributes:
         t_s: float64[n], start of each bucket: relative to now if rolling, to the start of the cycle
             if triggered.
-        buckets: The signals.
     """
 
     t_s: F64
@@ -164,14 +159,7 @@ class ScopeWindow:
 
 
 class Scope:
-    """The windows of one run.
-
-    Args:
-        sample_rate_hz: Samples per second.
-        segments: Segments of the run, in order.
-        loop_input: Signal on the abscissa of the loop.
-        signals: Number of signals.
-    """
+    """The windows of one run; ``loop_input`` is the signal on the abscissa of the loop."""
 
     def __init__(
         self,
@@ -227,8 +215,7 @@ class Scope:
     def whole_buckets(self, window_s: float, since: int) -> tuple[int, Buckets]:
         """Return the completed buckets of a rolling window from number ``since``.
 
-        Returns:
-            Number of the first bucket that is still stored, and the buckets from there on.
+        The first result is the number of the first of them that is still stored.
         """
         trace = self._rolling[window_s]
         first = max(since, trace.newest - trace.keep + 1, 0)

@@ -257,11 +257,7 @@ def _response(status: HTTPStatus, kind: str, body: bytes, policy: str = _POLICY)
 
 
 class LiveServer:
-    """Serves the page of all runs of this user on a port, 0 for any.
-
-    Raises:
-        RunError: The port is not available.
-    """
+    """Serves the page of all runs of this user on a port, 0 for any, unless taken (RunError)."""
 
     def __init__(
         self, chosen: Callable[[list[RunFolder]], RunFolder | None], port: int = 0

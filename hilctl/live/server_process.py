@@ -53,12 +53,8 @@ def serve_runs(
 ) -> None:
     """Serve the page, or Foxglove and compatible applications, until ``over`` returns true.
 
-    Args:
-        chosen: Returns the run that a page shows by default.
-        over: Returns whether to end the server.
-        on_url: Called with the address of the page, including its token.
-        port: Port to listen on; None for any, and for the default port of the applications.
-        foxglove: Serve Foxglove instead of the page.
+    ``chosen`` returns the run that a page shows by default. ``on_url`` gets the address, including
+    its token. ``port`` None is any port, and the default one of the applications.
 
     Raises:
         InputError: The library of Foxglove is not installed.
@@ -81,8 +77,7 @@ def serve_runs(
 def served_beside() -> Iterator[str]:
     """Serve the page of the run that this process is about to supervise; yield its address.
 
-    Raises:
-        RunError: The server cannot be started.
+    Raise RunError if the server cannot be started.
     """
     process = subprocess.Popen(
         # -P: never import from the working folder.

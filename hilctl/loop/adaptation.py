@@ -172,9 +172,7 @@ class Adaptation:
     """Adaptation of one run; called in every tick, it never waits, and its output is finite.
 
     Args:
-        operator: Operator to adapt.
         time_constant_s: Time constant of the parameters, > 0.
-        rate_hz: Samples per second.
         due_after: Samples from a reference to its displacement.
         shown_after: Samples from an input to its displacement.
         noise_um: Standard deviation of the sensor's noise; None: set by :meth:`take_noise`, and

@@ -8,12 +8,7 @@ from hilctl.models.base import HysteresisModel, Operator
 
 
 class Compensator:
-    """The inverse of a model, used by loop and replay; without a model it passes the input on.
-
-    Args:
-        model: Model to invert, or None.
-        sample_rate_hz: Samples per second.
-    """
+    """The inverse of a model, used by loop and replay; without a model it passes the input on."""
 
     def __init__(self, model: HysteresisModel | None, sample_rate_hz: float) -> None:
         self._operator: Operator | None = model.inverse(sample_rate_hz) if model else None

@@ -66,8 +66,7 @@ class Limiter:
     def limit(self, wanted: F64, command: F64, flags: U32) -> int:
         """Fill ``command`` (float64[n]) with limited commands; add to ``flags`` (uint32[n]).
 
-        Returns:
-            Index of the first requested command that is not finite, or -1.
+        Return the index of the first requested command that is not finite, or -1.
         """
         return self._apply(wanted, self._max_step, command, flags)
 

@@ -59,13 +59,7 @@ _ARM_MARGIN_NS = 1_000_000  # arming too early costs nothing; too late, it delay
 
 
 class Loop:
-    """Run one plan on one device.
-
-    Args:
-        plan: The plan.
-        device: Open device.
-        host: Clock, slots of blocks, and supervision.
-    """
+    """Run one plan on one open device, in a host."""
 
     def __init__(self, plan: LoopPlan, device: Device, host: Host) -> None:
         period_ns = plan.block / plan.sample_rate_hz * 1e9

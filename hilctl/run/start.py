@@ -42,13 +42,10 @@ OnPart: TypeAlias = Callable[[float], None]  # called with the completed part of
 def checked_experiment(
     path: Path, settings: Sequence[str], heat_a2: float = 0.0
 ) -> CheckedExperiment:
-    """Load an experiment and check it against device, model and limits.
+    """Load an experiment and check it; raise InputError with all problems.
 
     ``settings`` are ``key=value`` texts that override the file; ``heat_a2`` is the minimum heat of
     the coil, in A^2.
-
-    Raises:
-        InputError: The experiment is not valid; all problems are listed.
     """
     return check(load_experiment(path, settings), heat_a2)
 
@@ -56,8 +53,7 @@ def checked_experiment(
 def output_of(checked: CheckedExperiment, output: Path | None) -> Path:
     """Return the recording to write: ``output``, or a new name in the folder of recordings.
 
-    Raises:
-        InputError: The folder cannot be created, or ``output`` is an input of the run.
+    Raise InputError if the folder cannot be created, or ``output`` is an input of the run.
     """
     if output is not None:
         loaded = checked.loaded
@@ -77,13 +73,9 @@ def start_run(
     on_progress: Callable[[Progress], None],
     heat_a2: float = 0.0,
 ) -> RunResult:
-    """Run an experiment file to its end.
+    """Run an experiment file to its end; in a separate process if this program has threads.
 
-    In a program with threads, such as a notebook, it runs in a separate process.
-
-    Raises:
-        InputError: Nothing has moved, and no file is left.
-        RunError: The run failed to start; nothing has moved, and no file is left.
+    Raise InputError or RunError if the run cannot start: nothing has moved, and no file is left.
     """
     require_linux()
     if has_threads():
@@ -203,10 +195,8 @@ def has_threads() -> bool:
 def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) -> RunResult:
     """Run an experiment in a separate process; return the result. The run stops with this process.
 
-    Raises:
-        HilctlError: Error of the run.
-        RunError: Its process ended without a result.
-        KeyboardInterrupt: It was interrupted before anything moved.
+    Raise the run's HilctlError, RunError if its process ended without a result, and
+    KeyboardInterrupt if it was interrupted before anything moved.
     """
     read_end, write_end = os.pipe()
     with os.fdopen(read_end, "rb") as answers:

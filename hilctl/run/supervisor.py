@@ -238,10 +238,8 @@ class Supervisor:
     def run(self) -> RunResult:
         """Run to the end.
 
-        Raises:
-            InputError: The recording cannot be written, or another run holds the device; nothing
-                has moved, and no file is left.
-            RunError: The loop failed to start; nothing has moved, and no file is left.
+        Raise InputError if the recording cannot be written or another run holds the device, and
+        RunError if the loop failed to start. Then nothing has moved, and no file is left.
         """
         be_ordinary()
         config = self._config

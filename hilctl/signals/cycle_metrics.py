@@ -58,15 +58,10 @@ class MeanCycle:
 class CycleAverager:
     """Incremental mean of cycles of paired signals on phase bins.
 
-    A sample's phase is its index modulo the period, so that gaps and fractional periods are
-    allowed. All signals of a sample go to the same bin, so their means stay paired. There is at
-    most one bin per sample of a period; empty bins and samples with a non-finite signal are
+    A sample's phase is its index modulo the period, > 0 samples, not necessarily whole, so that
+    gaps are allowed. All signals of a sample go to the same bin, so their means stay paired. There
+    is at most one bin per sample of a period; empty bins and samples with a non-finite signal are
     skipped.
-
-    Args:
-        period: Samples in one period, > 0, not necessarily whole.
-        signals: Number of signals.
-        max_bins: Largest number of bins.
     """
 
     def __init__(self, period: float, signals: int, max_bins: int = MAX_BINS) -> None:
@@ -76,12 +71,7 @@ class CycleAverager:
         self._sums = np.zeros((signals + 1, bins))
 
     def add(self, index: I64, signals: F64) -> None:
-        """Add samples.
-
-        Args:
-            index: int64[n], sample index; phase 0 at multiples of the period.
-            signals: float64[k, n].
-        """
+        """Add signals, float64[k, n], of samples, int64[n]; phase 0 at multiples of the period."""
         # Integer division is ten times faster, with the same result.
         whole = self._period.is_integer()
         finite = np.isfinite(signals).all(axis=0)
@@ -138,10 +128,7 @@ def widest_gap(loop_input: F64, output: F64) -> BranchGap | None:
 
     Input and output are float64[m], one cycle in order of phase. The loop is split where its input
     turns. At every input each rising branch is compared with each falling one, with linear
-    interpolation; this includes the branches of minor loops.
-
-    Returns:
-        The largest distance; None if no rising and falling branch share an input.
+    interpolation; this includes the branches of minor loops. None if no branches share an input.
     """
     if loop_input.size < _FEWEST_BINS or np.ptp(loop_input) <= 0.0:
         return None
@@ -240,19 +227,13 @@ def percent(part: float, whole: float) -> float | None:
 
 
 def sensor_noise_um(index: I64, displacement_um: F64) -> float | None:
-    """Estimate the rms of white noise on a smooth displacement.
+    """Estimate the rms of white noise on a smooth displacement; None with fewer than 32 windows.
 
     The noise is the residual of seven neighbouring samples from a polynomial of degree 5 (their
     sixth difference, scaled to gain 1 for white noise); for an 83 um sine at 250 Hz and 50 kHz that
     is 1 pm. The median magnitude ignores spikes, steps and the corners of a triangle. Low-passed
-    noise is underestimated: by 13 % at a bandwidth of 0.3 times the sample rate.
-
-    Args:
-        index: int64[n], sample index; windows with a gap are skipped.
-        displacement_um: float64[n]; non-finite values count as gaps.
-
-    Returns:
-        rms in um; None with fewer than 32 windows.
+    noise is underestimated: by 13 % at a bandwidth of 0.3 times the sample rate. Windows with a gap
+    of the sample index, int64[n], or a reading that is not finite are skipped.
     """
     finite = np.isfinite(displacement_um)
     windows = noise_windows_um(index[finite], displacement_um[finite])
@@ -260,12 +241,7 @@ def sensor_noise_um(index: I64, displacement_um: F64) -> float | None:
 
 
 def noise_windows_um(index: I64, displacement_um: F64) -> F64:
-    """Return the magnitude of the residual of each window: float64[m], m <= n - 6.
-
-    Args:
-        index: int64[n], sample index; windows with a gap are skipped.
-        displacement_um: float64[n], finite.
-    """
+    """Return the magnitude of the residual of each window without a gap: float64[m], m <= n - 6."""
     unbroken = index[_ORDER:] - index[:-_ORDER] == _ORDER
     return np.asarray(np.abs(np.diff(displacement_um, _ORDER)[unbroken]))
 
@@ -284,16 +260,12 @@ def expected_maximum(values: int) -> float:
 
 
 def noise_floor_percent(noise_um: float, counts: I64, peak_to_peak_um: float) -> float | None:
-    """Return the apparent peak hysteresis of a loop without hysteresis, due to noise.
+    """Return the peak hysteresis of a loop without hysteresis, due to noise of an rms in um.
 
-    A mean cycle of m bins has m/2 pairs of a rising and a falling bin; the difference of each pair
-    has the noise of two bin means. The result is the expected maximum. Loops with several branches
-    have more pairs and a floor up to about 20 % higher.
-
-    Args:
-        noise_um: rms of a single sample, in um.
-        counts: int64[m], samples in each bin of the mean cycle.
-        peak_to_peak_um: Peak-to-peak of its output; the result is in percent of it, or None.
+    A mean cycle of m bins, with ``counts`` samples each, has m/2 pairs of a rising and a falling
+    bin; the difference of each pair has the noise of two bin means. The result is the expected
+    maximum, in percent of the peak-to-peak, or None. Loops with several branches have more pairs
+    and a floor up to about 20 % higher.
     """
     if counts.size == 0 or peak_to_peak_um <= 0.0:
         return None

@@ -21,15 +21,10 @@ _TIME_TOLERANCE = 0.01  # largest deviation of a step from the median
 
 
 def read_samples(w: spec.FileWaveform, sample_rate_hz: float, folder: Path) -> tuple[F64, float]:
-    """Read a waveform at the run's sample rate.
+    """Read a waveform at the run's sample rate; return it, and its period in samples or 0.0.
 
-    Returns:
-        float64[n], the samples in the waveform's unit, and the period in samples (0.0 if it
-        is not periodic).
-
-    Raises:
-        InputError: The file, column or a row is missing, a value is not finite, its rate is
-            unknown, or it differs from the run's and ``resample`` is ``refuse``.
+    Raise InputError if the file, column or a row is missing, a value is not finite, its rate is
+    unknown, or it differs from the run's and ``resample`` is ``refuse``.
     """
     path = folder / w.path
     try:
@@ -138,7 +133,6 @@ class Reference:
 
     Attributes:
         values: float64[n], read-only, in ``unit``.
-        unit: ``um``, ``A`` or ``V``.
         segments: Its waveforms with their steady parts.
         span: Lowest and highest value.
         repeats: Periodic parts of a long one.
@@ -171,9 +165,8 @@ def build(
 ) -> Reference:
     """Compute every sample of a waveform; ``rest`` is the default of its key of that name.
 
-    Raises:
-        InputError: A file is not usable, the waveform is too long, a soft start does not fit, a
-            frequency is not below half the sample rate, or a value is too large for a float.
+    Raise InputError if a file is not usable, the waveform is too long, a soft start does not fit, a
+    frequency is not below half the sample rate, or a value is too large for a float.
     """
     if waveform.unit is None:
         raise InputError("unit is required: um, A or V")

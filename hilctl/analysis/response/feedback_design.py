@@ -47,8 +47,6 @@ class LoopMargins:
 
     Attributes:
         crossover_hz: Lowest frequency at which its gain is 1.
-        gain_margin_db: Gain margin.
-        phase_margin_deg: Phase margin.
         peak_sensitivity: Largest factor by which the loop amplifies a disturbance.
     """
 
@@ -71,12 +69,9 @@ class FeedbackDesign:
     """Proposed feedback of a run's experiment.
 
     Attributes:
-        path: The recording.
         feedback: Keys of the proposed ``feedback``.
         proposed: Figures of its open loop.
         recorded: Figures of the feedback of the run; None if it had none.
-        response: The measured response.
-        loop: The open loop of the proposal.
     """
 
     path: Path

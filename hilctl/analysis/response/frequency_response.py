@@ -67,14 +67,12 @@ class FrequencyResponse:
     """Frequency response of a run.
 
     Attributes:
-        path: The recording.
         signals: Input and output.
         unit: Unit of the response, such as ``um/A``.
         excitation: The excitation in words.
         method: Evaluation of the excitation.
         averages: Number of periods or averaged spectra, or the fewest cycles of a sine.
         amplitude: Half the peak-to-peak of the input.
-        excited_lines: Number of excited frequencies.
         frequency_hz: float64[k], those above the noise.
         response: complex128[k], output over input as sampled (H1).
         noise: float64[k], standard deviation of each.

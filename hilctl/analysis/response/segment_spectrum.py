@@ -93,8 +93,6 @@ class SegmentSpectrum:
     """Spectrum of the displacement in one segment.
 
     Attributes:
-        path: The recording.
-        label: The waveform of the segment.
         start_s: Time of the first evaluated sample in the run.
         duration_s: Duration of the evaluated samples.
         frequency_hz: float64[k], > 0.
@@ -126,8 +124,7 @@ def _plain(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 def spectra(recording: Recording) -> tuple[SegmentSpectrum, ...]:
     """Return the spectra of the segments at rest and of the sines with two steady cycles.
 
-    Raises:
-        DataError: There is no such segment, or too many of its samples are missing.
+    Raise DataError if there is no such segment, or too many of its samples are missing.
     """
     found = [each for part in recording.segments if (each := _spectrum(recording, part))]
     if not found:

@@ -121,7 +121,6 @@ class StepResponse:
     """Response of the displacement to the largest step of a segment.
 
     Attributes:
-        path: The recording.
         start_s: Time of the step in the run.
         dwell_s: Time to the next step, or to the end of the segment.
         height_um: Change of the displacement, to the mean of the last tenth before the next step.
@@ -155,8 +154,7 @@ def step_response(
 ) -> StepResponse:
     """Return the response to the largest step of a segment, the last step segment by default.
 
-    Raises:
-        DataError: There is no step, or a displacement after it is not a number.
+    Raise DataError if there is no step, or a displacement after it is not a number.
     """
     steps = [each for each in recording.segments if each.kind == "step"]
     if segment is None:

@@ -174,10 +174,8 @@ def _guardian_status(run: RunFolder) -> dict[str, Any]:
 def request_stop(run: RunFolder) -> bool:
     """Stop a run by its safe ramp; return whether a process received the request.
 
-    A guardian that is active after its run is ended immediately.
-
-    Raises:
-        RunError: The kernel refuses.
+    A guardian that is active after its run is ended immediately. Raise RunError if the kernel
+    refuses.
     """
     try:
         process = os.pidfd_open(run.card.supervisor)
@@ -207,8 +205,7 @@ def stop_runs(
 ) -> list[dict[str, Any]]:
     """Stop runs by their safe ramps, all at the same time.
 
-    Returns:
-        The card of each run with ``ended``, and ``error``: why the request failed, or empty.
+    Return the card of each run with ``ended``, and ``error``: why the request failed, or empty.
     """
     refused = [_refusal(run) for run in chosen]
     deadline = clock() + wait_s

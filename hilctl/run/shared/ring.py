@@ -52,15 +52,10 @@ _TYPES = (np.int64, np.float64, np.float64, np.uint32, np.float64)
 
 
 class SampleRing:
-    """The ring, for producer, consumer and watchers.
+    """The ring, for producer, consumer and watchers; these ``look_only``.
 
-    Args:
-        look_only: Map it read-only, for watchers.
-        at_once: Map all pages now, for the loop, whose memory may not be locked.
-
-    Raises:
-        ValueError: The file is not a ring, or is damaged.
-        OSError: The file cannot be opened.
+    ``at_once`` maps all pages now, for the loop, whose memory may not be locked. Raise ValueError
+    if the file is not a ring or is damaged, OSError if it cannot be opened.
     """
 
     def __init__(self, path: Path, *, look_only: bool = False, at_once: bool = False) -> None:
