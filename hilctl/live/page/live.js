@@ -60,6 +60,12 @@ function over() {
   return status !== null && status.ended;
 }
 
+function element(tag, content = [], more = {}) {
+  const made = Object.assign(document.createElement(tag), more);
+  made.append(...[content].flat());
+  return made;
+}
+
 function ask(what, more, then = () => {}) {
   const id = nextId++;
   waiting.set(id, then);
@@ -165,10 +171,7 @@ function showRuns() {
   if ($("runs").dataset.key === key) return;
   $("runs").dataset.key = key;
   $("runs").replaceChildren(...names.filter(() => names.length > 1).map((name) => {
-    const link = document.createElement("a");
-    link.href = `/?run=${encodeURIComponent(name)}#${token}`;
-    link.target = "_blank";
-    link.textContent = name;
+    const link = element("a", name, { href: `/?run=${encodeURIComponent(name)}#${token}`, target: "_blank" });
     if (name === status.run) link.setAttribute("aria-current", "page");
     return link;
   }));
@@ -179,20 +182,11 @@ function showFigures() {
   const shownFigures = [...FIGURES, ...status.aux.map(({ name, unit: what }) => [name, name, what, 2])];
   const values = { ...status.figures, ...Object.fromEntries(status.aux.map(({ name, value }) => [name, value])) };
   if (tiles.childElementCount !== shownFigures.length) {
-    tiles.replaceChildren(...shownFigures.map(([key, label]) => {
-      const tile = document.createElement("div");
-      const term = document.createElement("dt");
-      term.textContent = label;
-      const value = document.createElement("dd");
-      value.id = `figure-${key}`;
-      tile.append(term, value);
-      return tile;
-    }));
+    tiles.replaceChildren(...shownFigures.map(([key, label]) => (
+      element("div", [element("dt", label), element("dd", [], { id: `figure-${key}` })]))));
   }
   for (const [key, , what, decimals] of shownFigures) {
-    const small = document.createElement("small");
-    small.textContent = ` ${what}`;
-    $(`figure-${key}`).replaceChildren(number(values[key], decimals), small);
+    $(`figure-${key}`).replaceChildren(number(values[key], decimals), element("small", ` ${what}`));
     $(`figure-${key}`).parentElement.hidden = key.includes("error") && status.description.waveform_unit !== "um";
   }
 }
@@ -200,23 +194,13 @@ function showFigures() {
 function showGauges() {
   const list = status.gauges;
   const box = $("gauges");
-  const names = list.map((gauge) => gauge.name).join();
-  if (box.dataset.names !== names) {
-    box.dataset.names = names;
-    box.replaceChildren(...list.map((gauge) => {
-      const row = document.createElement("div");
-      row.className = "gauge";
-      const bar = document.createElement("i");
-      bar.append(document.createElement("b"));
-      const label = document.createElement("span");
-      label.textContent = gauge.name;
-      const part = document.createElement("span");
-      part.className = "num";
-      const text = document.createElement("small");
-      text.className = "num";
-      row.append(label, bar, part, text);
-      return row;
-    }));
+  const names = list.map((gauge) => gauge.name);
+  if (box.dataset.names !== names.join()) {
+    box.dataset.names = names.join();
+    const num = { className: "num" };
+    box.replaceChildren(...names.map((name) => element("div", [
+      element("span", name), element("i", element("b")), element("span", [], num), element("small", [], num),
+    ], { className: "gauge" })));
   }
   list.forEach((gauge, at) => {
     const [, bar, part, text] = box.children[at].children;
@@ -247,14 +231,8 @@ function showEvents() {
   if (log.dataset.key === key) return;
   log.dataset.key = key;
   log.replaceChildren(...status.events.toReversed().map((event) => {
-    const line = document.createElement("li");
+    const line = element("li", [element("span", time(event.t_s), { className: "num" }), element("span", `${event.code}: ${event.text}`)]);
     line.dataset.kind = event.level;
-    const at = document.createElement("span");
-    at.className = "num";
-    at.textContent = time(event.t_s);
-    const text = document.createElement("span");
-    text.textContent = `${event.code}: ${event.text}`;
-    line.append(at, text);
     return line;
   }));
 }
@@ -272,15 +250,7 @@ function showKeys() {
   const key = JSON.stringify(rows);
   if (body.dataset.key === key) return;
   body.dataset.key = key;
-  body.replaceChildren(...rows.map((cells) => {
-    const row = document.createElement("tr");
-    row.append(...cells.map((text) => {
-      const cell = document.createElement("td");
-      cell.textContent = text;
-      return cell;
-    }));
-    return row;
-  }));
+  body.replaceChildren(...rows.map((cells) => element("tr", cells.map((text) => element("td", text)))));
 }
 
 // ---- plots
@@ -369,12 +339,7 @@ function build() {
 function addAux() {
   const { aux } = status.description;
   const units = [...new Set(aux.map((each) => each.unit))];
-  $("plots-aux").replaceChildren(...units.map((what) => {
-    const box = document.createElement("div");
-    box.className = "plot";
-    box.id = `plot-aux-${what}`;
-    return box;
-  }));
+  $("plots-aux").replaceChildren(...units.map((what) => element("div", [], { className: "plot", id: `plot-aux-${what}` })));
   const inks = ["displacement", "command", "error", "reference"];
   for (const what of units) {
     const lines = aux.filter((each) => each.unit === what).map(({ name }, at) => [name, series(name, colour(inks[at % inks.length]))]);
@@ -522,12 +487,9 @@ function redraw() {
 
 function showKey() {
   $("key").replaceChildren(...scopePlots().flatMap(({ plot }) => plot.series.slice(1).map((each, at) => {
-    const name = document.createElement("button");
-    const sample = document.createElement("i");
-    name.type = "button";
-    name.setAttribute("aria-pressed", String(each.show));
+    const sample = element("i");
     sample.style.borderTop = `${each.dash ? "dashed" : "solid"} 2px ${each.stroke()}`;
-    name.append(sample, each.label);
+    const name = element("button", [sample, each.label], { type: "button", ariaPressed: String(each.show) });
     name.addEventListener("click", () => {
       scope.hidden[each.show ? "add" : "delete"](each.label);
       plot.setSeries(at + 1, { show: !each.show });
@@ -541,22 +503,12 @@ function showKey() {
 function showRanges() {
   const open = $("ranges").firstElementChild;
   $("ranges").replaceChildren(open, ...Object.keys(plots).filter((id) => plots[id].signals).map((id) => {
-    const row = document.createElement("div");
-    row.className = "row";
-    const name = document.createElement("span");
-    name.textContent = plots[id].plot.axes[1].label;
-    const ends = ["low", "high"].map((end, at) => {
-      const field = document.createElement("input");
-      field.inputMode = "decimal";
-      field.id = `${id}-${end}`;
-      field.placeholder = "automatic";
-      field.setAttribute("aria-label", `${name.textContent}: ${end} end`);
-      field.value = scope.ranges.get(id)?.[at] ?? "";
-      field.addEventListener("change", () => setRange(id));
-      return field;
-    });
-    row.append(name, ...ends);
-    return row;
+    const { label } = plots[id].plot.axes[1];
+    const ends = ["low", "high"].map((end, at) => element("input", [], {
+      inputMode: "decimal", id: `${id}-${end}`, placeholder: "automatic", ariaLabel: `${label}: ${end} end`,
+      value: scope.ranges.get(id)?.[at] ?? "", onchange: () => setRange(id),
+    }));
+    return element("div", [element("span", label), ...ends], { className: "row" });
   }));
 }
 
@@ -623,9 +575,8 @@ function freeze() {
 }
 
 function save(blob, kind) {
-  const link = document.createElement("a");
-  link.href = URL.createObjectURL(blob);
-  link.download = `${status.run}-${time(status.t_s).replace(":", "m")}s.${kind}`;
+  const download = `${status.run}-${time(status.t_s).replace(":", "m")}s.${kind}`;
+  const link = element("a", [], { href: URL.createObjectURL(blob), download });
   link.click();
   setTimeout(() => URL.revokeObjectURL(link.href), 1000);
 }

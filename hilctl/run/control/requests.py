@@ -201,19 +201,13 @@ class Changes:
             return None
         return "in" if self._inverse_share else "out"
 
-    def make(
-        self,
-        gain: float | None,
-        offset: float | None,
-        over_s: float,
-        inverse: InverseState | None = None,
-    ) -> dict[str, Any]:
-        """Make a change when the loop has taken the previous one; None: unchanged."""
-        if gain is None and offset is None and inverse is None:
+    def make(self, wanted: "SetRequest") -> dict[str, Any]:
+        """Make a change when the loop has taken the previous one."""
+        if wanted.gain is None and wanted.offset is None and wanted.inverse is None:
             raise InputError("set: gain, offset or inverse is required")
-        if inverse is not None:
+        if wanted.inverse is not None:
             checked = self._checked
-            if why := fade_refusal(checked.loaded, checked.forecast.line, inverse):
+            if why := fade_refusal(checked.loaded, checked.forecast.line, wanted.inverse):
                 raise InputError(f"set: inverse: {why}")
         if not self._places.acquire(blocking=False):
             raise InputError(f"set: {_MOST_WAITING} changes are waiting already: try again")
@@ -226,7 +220,7 @@ class Changes:
                     # The loop must have taken the previous change, which is overwritten.
                     page = self._page
                     if page.get(PageField.TUNE_WANTED) == page.observe(PageField.TUNE_TAKEN):
-                        return self._make(gain, offset, over_s, inverse)
+                        return self._make(wanted)
                 if self._clock() >= until:
                     raise InputError("set: the loop has not taken the previous change: try again")
                 self._sleep(_POLL_S)
@@ -241,13 +235,11 @@ class Changes:
             return "the waveform has ended; the run is in its safe ramp"
         return ""
 
-    def _make(
-        self, gain: float | None, offset: float | None, over_s: float, inverse: InverseState | None
-    ) -> dict[str, Any]:
+    def _make(self, wanted: "SetRequest") -> dict[str, Any]:
         """Write a change to the page; return the answer."""
-        gain = self.gain if gain is None else gain
-        offset = self.offset if offset is None else offset
-        share = _SHARES.get(inverse, self._inverse_share)
+        gain = self.gain if wanted.gain is None else wanted.gain
+        offset = self.offset if wanted.offset is None else wanted.offset
+        share = _SHARES.get(wanted.inverse, self._inverse_share)
         bypassed = min(share, self._inverse_share) < 1.0
         if why := bound_refusal(self._checked, gain, offset, bypassed=bypassed):
             raise InputError(f"set: {why}")
@@ -263,7 +255,7 @@ class Changes:
         if line := self._checked.forecast.line:
             page.put_float(PageField.TUNE_LINE_SLOPE, line.slope)
             page.put_float(PageField.TUNE_LINE_AT_ZERO, line.at_zero)
-        page.put(PageField.TUNE_SAMPLES, max(1, round(over_s * config.sample_rate_hz)))
+        page.put(PageField.TUNE_SAMPLES, max(1, round(wanted.over_s * config.sample_rate_hz)))
         page.put(PageField.TUNE_BEGINS_AT, begins_at)
         # Last: the loop reads the numbers above when the count changes.
         page.publish(PageField.TUNE_WANTED, page.get(PageField.TUNE_WANTED) + 1)
@@ -272,7 +264,7 @@ class Changes:
             "gain": gain,
             "offset": offset,
             "inverse": self.inverse,
-            "over_s": over_s,
+            "over_s": wanted.over_s,
             "begins_at_sample": begins_at,
         }
 
@@ -342,7 +334,7 @@ class SetRequest(StrictModel):
     command: Literal["set"]
     gain: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
     offset: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
-    inverse: Literal["in", "out"] | None = None
+    inverse: InverseState | None = None
     over_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
 
 
@@ -391,7 +383,7 @@ class Requests:
             return self._status()
         if isinstance(request, MarkRequest):
             return self._mark(request.text)
-        return self._changes.make(request.gain, request.offset, request.over_s, request.inverse)
+        return self._changes.make(request)
 
     def _mark(self, text: str) -> dict[str, Any]:
         if not self._recording.takes_marks:

@@ -30,6 +30,7 @@ from hilctl.run.control.requests import (
     Changes,
     ControlServer,
     Requests,
+    SetRequest,
     bound_refusal,
     command_range,
 )
@@ -206,7 +207,8 @@ def changes(experiment, page, waits):
 
 
 def change(changes, gain=None, offset=None, over_s=0.2, inverse=None):
-    return changes.make(gain, offset, over_s, inverse)
+    wanted = SetRequest(command="set", gain=gain, offset=offset, over_s=over_s, inverse=inverse)
+    return changes.make(wanted)
 
 
 def take(page, at):
