@@ -1,13 +1,17 @@
 """Types of arrays and of the unit of commands, for signatures."""
 
 from collections.abc import Iterator
-from typing import Literal, TypeAlias
+from typing import Annotated, Literal, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
 F64: TypeAlias = npt.NDArray[np.float64]
-"""A float64 array; docstrings give its shape and unit."""
+"""A float64 array; docstrings give its shape and unit. In kernels it has one dimension."""
+
+F64_2D: TypeAlias = Annotated[F64, "float64[:, ::1]"]
+F64_3D: TypeAlias = Annotated[F64, "float64[:, :, ::1]"]
+"""Arrays of kernels with numba's type: two and three dimensions, contiguous."""
 
 U32: TypeAlias = npt.NDArray[np.uint32]
 """A uint32 array, used for sample flags."""

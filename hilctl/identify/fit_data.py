@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.fft import irfft, rfft
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64, CommandUnit
+from hilctl.base.types import F64, F64_2D, CommandUnit
 from hilctl.identify.data.records import History, Record, Records, SteadyLoop
 from hilctl.kernels.hysteresis import play_outputs, play_sum_shared, rest_memory
 from hilctl.kernels.jit import kernel
@@ -30,7 +30,7 @@ LAG_S, GROWTH, SPACING, GAMMA_S = range(4)
 PARAMETERS = 4
 
 
-@kernel("UniTuple(float64, 3)(float64, float64, float64, float64)")
+@kernel()
 def _relaxed(behind: float, slope: float, lag: float, step: float) -> tuple[float, float, float]:
     """Return e after a step of e' = slope - e / lag, and its derivatives by e and by lag."""
     left = math.exp(-step / lag)
@@ -39,11 +39,16 @@ def _relaxed(behind: float, slope: float, lag: float, step: float) -> tuple[floa
     return slope * lag + rest * left, left, by_lag
 
 
-@kernel(
-    "void(float64[::1], float64, float64, float64, int64, int64, float64[::1], float64[:, ::1])"
-)
+@kernel()
 def lagged(
-    v: F64, step_s: float, lag_s: float, growth: float, substeps: int, settle: int, w: F64, dw: F64
+    v: F64,
+    step_s: float,
+    lag_s: float,
+    growth: float,
+    substeps: int,
+    settle: int,
+    w: F64,
+    dw: F64_2D,
 ) -> None:
     """Compute the response of w' = (v - w) / (lag (1 + growth |v - w|)) to a periodic command.
 
@@ -81,21 +86,18 @@ def lagged(
             dw[j, 1] = -e_growth
 
 
-@kernel(
-    "void(float64[::1], float64[:, ::1], float64[::1], float64, float64, float64[::1],"
-    " float64[::1], int64, float64[:, ::1], float64[:, ::1])"
-)
+@kernel()
 def plays_and_slopes(
     w: F64,
-    dw: F64,
+    dw: F64_2D,
     speed: F64,
     spacing: float,
     gamma_s: float,
     numbers: F64,
     weights: F64,
     turns: int,
-    out: F64,
-    slopes: F64,
+    out: F64_2D,
+    slopes: F64_2D,
 ) -> None:
     """Run plays of thresholds ``spacing numbers_i + gamma speed``, from rest.
 

@@ -10,7 +10,7 @@ A number that announces nothing needs none of this: aligned eight bytes are writ
 """
 
 from collections.abc import Callable
-from typing import Any, TypeAlias, cast
+from typing import Annotated, Any, TypeAlias, cast
 
 from numba import types
 from numba.extending import intrinsic
@@ -55,6 +55,8 @@ def _plain_load(numbers: I64, index: int) -> int:
     return int(numbers[index])
 
 
+_ReadOnly: TypeAlias = Annotated[I64, "Array(int64, 1, 'C', readonly=True)"]
+
 # Without the compiler, as for a debugger, the order is that of the processor.
 _store: Callable[[I64, int, int], None] = _plain_store
 _load: Callable[[I64, int], int] = _plain_load
@@ -62,7 +64,7 @@ if not DISABLED:
     _store, _load = cast("Any", intrinsic(_typed_store)), cast("Any", intrinsic(_typed_load))
 
 
-@kernel("void(int64[::1], int64, int64)")
+@kernel()
 def publish(numbers: I64, index: int, value: int) -> None:
     """Set a number after all earlier writes and before all later ones.
 
@@ -71,8 +73,8 @@ def publish(numbers: I64, index: int, value: int) -> None:
     _store(numbers, index, value)
 
 
-@kernel("int64(Array(int64, 1, 'C', readonly=True), int64)")
-def observe(numbers: I64, index: int) -> int:
+@kernel()
+def observe(numbers: _ReadOnly, index: int) -> int:
     """Return a number, read after all earlier reads and before all later ones.
 
     ``numbers`` is int64[n] in shared memory, possibly read-only; the index is not checked.

@@ -28,7 +28,7 @@ _NEWTON_STEPS = 60
 _SMALL = 1e-17  # a growth that rounding hides
 
 
-@kernel("float64(float64, float64, float64)")
+@kernel()
 def _left_behind(behind: float, growth: float, periods: float) -> float:
     """Return the distance > 0 that remains after a sample with a constant command.
 
@@ -50,7 +50,7 @@ def _left_behind(behind: float, growth: float, periods: float) -> float:
     return math.exp(log) / growth
 
 
-@kernel("void(float64[::1], float64, float64, float64[::1], float64[::1])")
+@kernel()
 def lag_block(v: F64, periods: float, growth: float, memory: F64, out: F64) -> None:
     """Let a first-order lag follow a command that is held from sample to sample.
 
@@ -70,7 +70,7 @@ def lag_block(v: F64, periods: float, growth: float, memory: F64, out: F64) -> N
         out[k] = x
 
 
-@kernel("void(float64[::1], float64, float64, float64[::1], float64[::1])")
+@kernel()
 def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> None:
     """Find the commands that bring the lag of :func:`lag_block` to requested values, float64[n].
 
@@ -95,7 +95,7 @@ def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> 
         out[k] = command
 
 
-@kernel("float64(float64[::1], float64)", inline=True)
+@kernel(inline=True)
 def _oldest(memory: F64, now: float) -> float:
     """Append ``now`` to a queue of values, and return the oldest one, which leaves it."""
     last = memory.size - 1
@@ -110,7 +110,7 @@ def _oldest(memory: F64, now: float) -> float:
     return left
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+@kernel()
 def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
     """Sum a signal's last n >= 2 values; ``weights`` (float64[n]) begins with that of the oldest.
 
@@ -123,14 +123,14 @@ def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
         out[k] = total
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1])")
+@kernel()
 def delay_block(x: F64, memory: F64, out: F64) -> None:
     """Delay a signal by n samples; ``memory``, float64[n + 1], has these and the previous value."""
     for k in range(x.size):
         out[k] = _oldest(memory, x[k])
 
 
-@kernel("void(float64[::1], float64, float64[::1], float64[::1])")
+@kernel()
 def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
     """Interpolate a signal: ``part`` (0 to 1) of the way from the previous sample to each.
 
@@ -147,7 +147,7 @@ def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
 # Creep
 
 
-@kernel("float64(float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _crept(parameters: F64, memory: F64) -> float:
     """Advance all elements by a sample, and return their sum."""
     elements = memory.size - 1
@@ -160,7 +160,7 @@ def _crept(parameters: F64, memory: F64) -> float:
     return total
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+@kernel()
 def creep_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Add creep to a displacement from rest.
 
@@ -174,7 +174,7 @@ def creep_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
         out[k] = x[k] + total
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+@kernel()
 def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Subtract the creep: the inverse of :func:`creep_block`."""
     for k in range(y.size):
@@ -186,7 +186,7 @@ def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
 # Modes
 
 
-@kernel("UniTuple(float64, 2)(float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _carried(parameters: F64, memory: F64) -> tuple[float, float]:
     """Return position and velocity a sample later, without the effect of the next x."""
     position, velocity, before = memory[0], memory[1], memory[2]
@@ -195,12 +195,12 @@ def _carried(parameters: F64, memory: F64) -> tuple[float, float]:
     return p, q
 
 
-@kernel("void(float64, float64, float64, float64[::1])", inline=True)
+@kernel(inline=True)
 def _keep(position: float, velocity: float, x: float, memory: F64) -> None:
     memory[0], memory[1], memory[2] = position, velocity, x
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+@kernel()
 def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Pass a displacement through a pair of antiresonance and resonance.
 
@@ -219,7 +219,7 @@ def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
         out[k] = parameters[8] * position + parameters[9] * velocity + parameters[10] * now
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1])")
+@kernel()
 def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Run the exact inverse of :func:`mode_block`."""
     for k in range(y.size):

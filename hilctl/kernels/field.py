@@ -38,7 +38,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.types import F64, I64
+from hilctl.base.types import F64, F64_2D, I64
 from hilctl.kernels.jit import kernel
 
 Bank: TypeAlias = tuple[F64, F64, F64, F64, F64]
@@ -56,21 +56,16 @@ _NARROWEST = 1e-14
 _STILL, _SURE = -25.0, 300.0  # exponents of the creep without effect, and beyond which it is linear
 _NEAR = 1e-7  # of a change, and of its unit, to which it is worked out
 _OUTPUT, _COMMAND, _FIELD = 0, 1, 2
-_SPAN = "UniTuple(float64, 3)"
-_CURVE = "UniTuple(float64[::1], 2)"
-_BANK = "UniTuple(float64[::1], 5)"
-_ARRAY, _LOSSES = "float64[::1]", "UniTuple(float64, 9)"
-_RUN = f"void({_ARRAY}, {_SPAN}, {_BANK}, float64, {_LOSSES}, {_CURVE}, {_ARRAY}, {_ARRAY})"
 
 
-@kernel("int64(float64, float64)", inline=True)
+@kernel(inline=True)
 def _cell(place: float, cells: float) -> int:
     """Return the cell of a place; outside the cells, the nearest one."""
     # What is not a number must not become an index.
     return int(min(place, cells - 1.0)) if place > 0.0 else 0
 
 
-@kernel("float64(float64)", inline=True)
+@kernel(inline=True)
 def _gone(x: float) -> float:
     """Return 1 - exp(-x) for x >= 0, as a series for small x, as in most samples."""
     if x > 0.06:
@@ -79,7 +74,7 @@ def _gone(x: float) -> float:
     return x * (1.0 - x / 2.0 * (1.0 - x / 3.0 * (1.0 - x / 4.0 * (1.0 - x / 5.0 * tail))))
 
 
-@kernel("float64(float64, float64, float64, float64, float64)")
+@kernel()
 def dragged(held: float, low: float, width: float, last: float, way: float) -> float:
     """Return a drag's output in a cell after the field has risen by ``way`` >= 0, in lengths.
 
@@ -101,7 +96,7 @@ def dragged(held: float, low: float, width: float, last: float, way: float) -> f
     return held
 
 
-@kernel("float64(float64, float64, float64, float64, float64, float64)")
+@kernel()
 def drag_step(held: float, low: float, width: float, last: float, u: float, length: float) -> float:
     """Return a drag's output in a cell, 0 to ``width``, after the field went from last to u."""
     if u >= last:
@@ -116,13 +111,13 @@ def drag_step(held: float, low: float, width: float, last: float, u: float, leng
     return width - up * length
 
 
-@kernel("float64(int64, float64, float64)", inline=True)
+@kernel(inline=True)
 def _rest(cell: int, lowest: float, width: float) -> float:
     """Return the part of a cell, as a length, below a field of 0."""
     return min(max(-(lowest + cell * width), 0.0), width)
 
 
-@kernel("float64(float64, float64, int64, float64, float64)", inline=True)
+@kernel(inline=True)
 def _waited(held: float, width: float, above: int, up: float, down: float) -> float:
     """Return a drag's output in a cell that the field has left, ``above`` cells above the field."""
     # Below the field it takes its part in what has gone up since, above it in what has gone down.
@@ -131,21 +126,22 @@ def _waited(held: float, width: float, above: int, up: float, down: float) -> fl
     return held * math.exp(-down) if above > 0 else held
 
 
-@kernel("void(float64[::1], int64[::1], float64, float64, float64, int64, int64, float64[:, ::1])")
+@kernel()
 def drag_columns(
-    u: F64, rows: I64, length: float, lowest: float, width: float, cells: int, first: int, out: F64
+    u: F64,
+    rows: I64,
+    length: float,
+    lowest: float,
+    width: float,
+    cells: int,
+    first: int,
+    out: F64_2D,
 ) -> None:
     """Fill in the output of a drag of weight 1 in each cell, for identification.
 
-    Args:
-        u: float64[n], a path from rest; its turning points are enough.
-        rows: int64[N], samples of the path that are filled in, rising.
-        length: k.
-        lowest: Lower end of the first cell.
-        width: Width of a cell.
-        cells: Number of cells c.
-        first: Column of the first cell.
-        out: float64[N, m], of which c columns are filled; 0 is rest.
+    ``u`` is float64[n], a path from rest, of which the turning points are enough; ``rows`` is
+    int64[N], the samples that are filled in, rising. The c cells begin at ``lowest``, each with its
+    column of ``out``, float64[N, m], from ``first`` on; 0 is rest.
     """
     since = np.zeros(cells)
     held = np.minimum(np.maximum(-lowest - width * np.arange(cells), 0.0), width)
@@ -166,7 +162,7 @@ def drag_columns(
             out[row, first + j] = now - _rest(j, lowest, width)
 
 
-@kernel("float64(float64, float64[::1], float64[::1])")
+@kernel()
 def mapped(x: float, knots: F64, values: F64) -> float:
     """Return the value at ``x`` of a line through points, continued straight at its ends."""
     low, high = 0, knots.size - 1
@@ -180,7 +176,7 @@ def mapped(x: float, knots: F64, values: F64) -> float:
     return float(values[low] + slope * (x - knots[low]))
 
 
-@kernel(f"UniTuple(float64, 2)(float64, float64, int64, float64[::1], {_BANK})", inline=True)
+@kernel(inline=True)
 def _drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> tuple[float, float]:
     """Return a drag's output at a next u, and its slope, without moving it.
 
@@ -207,7 +203,7 @@ def _drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> tuple[float
     return total, slope / length
 
 
-@kernel(f"void(float64, float64, int64, float64[::1], {_BANK})", inline=True)
+@kernel(inline=True)
 def _move_drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> None:
     """Move a drag to a next u, and update the sums that :func:`_drag` uses."""
     thresholds, lengths, _, weights, grid = bank
@@ -233,7 +229,7 @@ def _move_drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> None:
     memory[sums], memory[sums + 1], memory[sums + 2] = total, up, down
 
 
-@kernel("UniTuple(float64, 4)(float64, float64)", inline=True)
+@kernel(inline=True)
 def _even(change: float, creep: float) -> tuple[float, float, float, float]:
     """Return what plays that creep have in common while u changes evenly, see :func:`_play`.
 
@@ -250,10 +246,7 @@ def _even(change: float, creep: float) -> tuple[float, float, float, float]:
     return way, grown / size, grown / (size * (1.0 + grown)), 1.0 + 1.0 / grown - 1.0 / size
 
 
-@kernel(
-    "UniTuple(float64, 3)(float64, float64, float64, float64, float64, UniTuple(float64, 4))",
-    inline=True,
-)
+@kernel(inline=True)
 def _play(
     held: float,
     u: float,
@@ -291,10 +284,7 @@ def _play(
     return held + side * creep * moved, part * by_way, 1.0 - part
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64, float64, float64, float64[::1], float64[::1])",
-    nogil=True,
-)
+@kernel(nogil=True)
 def play_path(
     u: F64, step_s: F64, threshold: float, creep: float, rate: float, out: F64, by: F64
 ) -> None:
@@ -312,7 +302,7 @@ def play_path(
         out[k], by[k] = held, slope
 
 
-@kernel(f"UniTuple(float64, 2)(float64, float64[::1], {_BANK})", inline=True)
+@kernel(inline=True)
 def _peek(u: float, memory: F64, bank: Bank) -> tuple[float, float]:
     """Return the output of the operators at a next u, and its slope, without moving them."""
     thresholds, lengths, values, _, grid = bank
@@ -336,7 +326,7 @@ def _peek(u: float, memory: F64, bank: Bank) -> tuple[float, float]:
     return total, slope
 
 
-@kernel(f"void(float64, float64[::1], {_BANK})", inline=True)
+@kernel(inline=True)
 def _settle(u: float, memory: F64, bank: Bank) -> None:
     """Move all operators to an effective field."""
     thresholds, lengths, grid = bank[0], bank[1], bank[4]
@@ -349,7 +339,7 @@ def _settle(u: float, memory: F64, bank: Bank) -> None:
     memory[memory.size - 6] = u
 
 
-@kernel(f"UniTuple(float64, 2)(float64, {_LOSSES})", inline=True)
+@kernel(inline=True)
 def lost_field(e: float, losses: Losses) -> tuple[float, float]:
     """Return h(e) and its slope."""
     growth, bend, excess, self_growth, even = losses[3:8]
@@ -366,21 +356,13 @@ def lost_field(e: float, losses: Losses) -> tuple[float, float]:
     return e * (grown + more + excess / root), slope
 
 
-@kernel(
-    f"void(float64[::1], float64[::1], float64[::1], float64[::1], {_LOSSES}, float64[::1])",
-    nogil=True,
-)
+@kernel(nogil=True)
 def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -> None:
-    """Compute the field behind the losses of a command, for known outputs of the operators.
+    """Compute the field behind the losses of a command, for known outputs ``m`` of the operators.
 
-    Args:
-        v: float64[n], command after a part, at least half, of the step that ends at each sample.
-        late: float64[n], that part.
-        step_s: float64[n], time of each step.
-        m: float64[n], the operators' output at each sample.
-        losses: See :data:`Losses`; the first three are in s, tau_b itself the third, and the last
-            is computed for each step.
-        w: float64[n], filled; the first is the first command.
+    ``v`` is the command after a part, ``late``, at least half, of the step that ends at each
+    sample, which takes ``step_s``; ``w`` is filled, the first with the first command: float64[n]
+    each. The first three of ``losses`` are in s, the third tau_b itself, and the last is not used.
     """
     w[0] = v[0]
     z = change = before = 0.0
@@ -402,9 +384,7 @@ def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -
         z = left * z + (1.0 - left) * lost
 
 
-@kernel(
-    f"UniTuple(float64, 3)(int64, float64, float64[::1], {_BANK}, float64, {_LOSSES})", inline=True
-)
+@kernel(inline=True)
 def _given(
     what: int, u: float, memory: F64, bank: Bank, coupling: float, losses: Losses
 ) -> tuple[float, float, float]:
@@ -422,7 +402,7 @@ def _given(
     return value, by_u, m
 
 
-@kernel(f"UniTuple(float64, 2)(int64, float64, {_SPAN}, float64[::1], {_BANK}, float64, {_LOSSES})")
+@kernel()
 def _root(
     what: int, target: float, span: Span, memory: F64, bank: Bank, coupling: float, losses: Losses
 ) -> tuple[float, float]:
@@ -467,7 +447,7 @@ def _root(
     return u, m
 
 
-@kernel(f"float64(int64, float64, {_SPAN}, float64[::1], {_BANK}, float64, {_LOSSES})")
+@kernel()
 def _advance(
     what: int, target: float, span: Span, memory: F64, bank: Bank, coupling: float, losses: Losses
 ) -> float:
@@ -494,7 +474,7 @@ def _advance(
     return m if what == _COMMAND else command
 
 
-@kernel(_RUN, nogil=True)
+@kernel(nogil=True)
 def field_forward(
     v: F64,
     span: Span,
@@ -505,18 +485,13 @@ def field_forward(
     memory: F64,
     out: F64,
 ) -> None:
-    """Run the model.
+    """Run the model, with ``bank``, ``losses`` and ``memory`` as above.
 
-    Args:
-        v: float64[n], commands, each held through the sample that ends with its output. A command
-            that is not finite gives NaN and leaves no trace.
-        span: Lowest and highest effective field, and the tolerance of a root, > 0.
-        bank: The operators.
-        coupling: Effective field per unit of the operators' output.
-        losses: See :data:`Losses`.
-        curve: float64[k], output of the operators, and float64[k], displacement in um, both rising.
-        memory: See the module's docstring.
-        out: float64[n], filled with um.
+    ``v`` is float64[n], commands, each held through the sample that ends with its output; one that
+    is not finite gives NaN and leaves no trace. ``span`` is the lowest and highest effective field,
+    and the tolerance of a root, > 0; ``coupling`` is the effective field per unit of the operators'
+    output; ``curve`` is that output and the displacement in um, float64[k] each, both rising.
+    ``out`` is float64[n], filled with um.
     """
     for k in range(v.size):
         if abs(v[k]) < math.inf:
@@ -526,7 +501,7 @@ def field_forward(
             out[k] = np.nan
 
 
-@kernel(_RUN)
+@kernel()
 def field_inverse(
     y: F64,
     span: Span,

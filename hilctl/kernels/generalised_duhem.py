@@ -31,47 +31,39 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.types import F64, I64
+from hilctl.base.types import F64, F64_2D, F64_3D, I64
+from hilctl.kernels.field import Losses
 from hilctl.kernels.jit import kernel
 
-Band: TypeAlias = tuple[F64, F64, F64, F64]
+Band: TypeAlias = tuple[F64_3D, F64_3D, F64_2D, F64]
 """Slopes float64[2, k, l], rising then falling, at k nodes of y and l across the band; longest step
 of y that begins in each cell, float64[2, k - 1, l - 1]; centre line and flux at these y, float64[2,
 k]; lowest y, distance of nodes of y, half the band's width b, distance of nodes across it."""
-Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
-"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, g, e_0, and the part that z
-before a sample has in its mean over the sample; the rest is h's."""
 
 _BEFORE_POLE = 0.9
 _STEPS = 100
 _MOST_STEPS = 1000  # of y in a sample; the rest of a jump goes by the slope that it begins with
 _NEAR_UM = 1e-9
-_BAND = "Tuple((float64[:, :, ::1], float64[:, :, ::1], float64[:, ::1], float64[::1]))"
-_LOSSES = "UniTuple(float64, 9)"
 
 
-@kernel("int64(float64, float64)", inline=True)
+@kernel(inline=True)
 def _cell(place: float, cells: float) -> int:
     """Return the cell of a place; outside the cells, the nearest one."""
     # A place that is not a number, from a memory that is none, must not become an index.
     return int(min(place, cells - 1.0)) if place > 0.0 else 0
 
 
-@kernel("float64(float64, float64[:, ::1], int64, float64[::1])", inline=True)
-def _along(y: float, lines: F64, line: int, grid: F64) -> float:
+@kernel(inline=True)
+def _along(y: float, lines: F64_2D, line: int, grid: F64) -> float:
     """Return the centre (line 0) or the flux (line 1) at a y, continued straight at its ends."""
     place = (y - grid[0]) / grid[1]
     i = _cell(place, lines.shape[1] - 1.0)
     return float(lines[line, i] + (lines[line, i + 1] - lines[line, i]) * (place - i))
 
 
-@kernel(
-    "Tuple((float64, float64, int64, int64, float64, float64))(float64, float64, int64,"
-    " float64[:, :, ::1], float64[::1])",
-    inline=True,
-)
+@kernel(inline=True)
 def _slope(
-    y: float, d: float, way: int, slopes: F64, grid: F64
+    y: float, d: float, way: int, slopes: F64_3D, grid: F64
 ) -> tuple[float, float, int, int, float, float]:
     """Return g, its slope across the band, the cells, and the position in these."""
     place, across = (y - grid[0]) / grid[1], (d + grid[2]) / grid[3]
@@ -82,7 +74,7 @@ def _slope(
     return low + b * (high - low), (high - low) / grid[3], i, j, a, b
 
 
-@kernel(f"UniTuple(float64, 2)(float64, float64, float64, {_BAND})", inline=True)
+@kernel(inline=True)
 def _followed(y: float, w: float, target: float, band: Band) -> tuple[float, float]:
     """Return the field after y has moved to ``target``, and dw/dy of the last step."""
     slopes, steps, lines, grid = band
@@ -106,16 +98,12 @@ def _followed(y: float, w: float, target: float, band: Band) -> tuple[float, flo
     return w, by_y
 
 
-@kernel(
-    "void(float64, int64, Tuple((float64, float64, int64, int64, float64, float64)),"
-    " float64[:, :, ::1], float64[::1])",
-    inline=True,
-)
+@kernel(inline=True)
 def _share_out(
     gain: float,
     way: int,
     found: tuple[float, float, int, int, float, float],
-    slopes: F64,
+    slopes: F64_3D,
     by_node: F64,
 ) -> None:
     """Distribute the derivative by a slope to the derivatives by the logarithms of four nodes."""
@@ -128,23 +116,15 @@ def _share_out(
     by_node[node + stride + 1] += gain * a * b * slopes[way, i + 1, j + 1]
 
 
-@kernel(
-    f"void(float64[::1], float64, float64, {_BAND}, int64[::1], float64[::1], float64[:, ::1])",
-    nogil=True,
-)
+@kernel(nogil=True)
 def duhem_columns(
-    y: F64, start_y: float, start_w: float, band: Band, rows: I64, w: F64, out: F64
+    y: F64, start_y: float, start_w: float, band: Band, rows: I64, w: F64, out: F64_2D
 ) -> None:
     """Follow a path, and compute the dependence of the fields on the logarithm of each slope.
 
-    Args:
-        y: float64[n], the path.
-        start_y: y before the first of them.
-        start_w: w there.
-        band: The operator.
-        rows: int64[N], points that are filled in, rising.
-        w: float64[n], filled with the field.
-        out: float64[N, m], filled; no columns if m is 0.
+    ``y`` is float64[n], the path from ``start_y`` and ``start_w``; ``rows`` is int64[N], points
+    that are filled in, rising. ``w`` is float64[n], filled with the field, ``out`` float64[N, m]; m
+    may be 0.
     """
     slopes, steps, lines, grid = band
     by_node = np.zeros(out.shape[1])
@@ -181,7 +161,7 @@ def duhem_columns(
             row += 1
 
 
-@kernel(f"UniTuple(float64, 2)(float64, {_LOSSES})", inline=True)
+@kernel(inline=True)
 def _lost(e: float, losses: Losses) -> tuple[float, float]:
     """Return h(e) and its slope."""
     growth, bend, excess, self_growth, even = losses[3:8]
@@ -198,7 +178,7 @@ def _lost(e: float, losses: Losses) -> tuple[float, float]:
     return e * (grown + more + excess / root), slope
 
 
-@kernel(f"UniTuple(float64, 4)(float64, float64[::1], {_BAND}, {_LOSSES})", inline=True)
+@kernel(inline=True)
 def _moved(y: float, memory: F64, band: Band, losses: Losses) -> tuple[float, float, float, float]:
     """Return w, z and the command after a sample that ends at y, and the command's slope."""
     lines, grid = band[2], band[3]
@@ -212,7 +192,7 @@ def _moved(y: float, memory: F64, band: Band, losses: Losses) -> tuple[float, fl
     return w, z, command, 0.5 * by_y + (1.0 - losses[8]) * steeper * e_by_y
 
 
-@kernel(f"float64(float64, float64[::1], {_BAND}, {_LOSSES})")
+@kernel()
 def _root(command: float, memory: F64, band: Band, losses: Losses) -> float:
     """Return the y of a command; of a field before the first sample.
 
@@ -241,7 +221,7 @@ def _root(command: float, memory: F64, band: Band, losses: Losses) -> float:
     return y
 
 
-@kernel(f"void(float64[::1], {_BAND}, {_LOSSES}, float64[::1], float64[::1])", nogil=True)
+@kernel(nogil=True)
 def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> None:
     """Run the model.
 
@@ -259,7 +239,7 @@ def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> 
             out[k] = np.nan
 
 
-@kernel(f"void(float64[::1], {_BAND}, {_LOSSES}, float64[::1], float64[::1])")
+@kernel()
 def duhem_inverse(y: F64, band: Band, losses: Losses, memory: F64, out: F64) -> None:
     """Run the inverse, which is explicit; y in and commands out, see :func:`duhem_forward`."""
     for k in range(y.size):

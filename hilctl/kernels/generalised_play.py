@@ -15,32 +15,32 @@ Nonlinearities of Magnetostrictive Actuators", Concordia; equation numbers are t
 
 import math
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
 
 _SATURATED = 1.0 - 1e-12
 
 
-@kernel("float64(float64, float64[::1])", inline=True)
+@kernel(inline=True)
 def _envelope(v: float, shape: F64) -> float:
     return float(shape[0] * math.tanh(shape[1] * v + shape[2]) + shape[3])
 
 
-@kernel("float64(float64, float64[::1])", inline=True)
+@kernel(inline=True)
 def _inverse_envelope(z: float, shape: F64) -> float:
     level = (z - shape[3]) / shape[0]
     level = min(max(level, -_SATURATED), _SATURATED)
     return float((math.atanh(level) - shape[2]) / shape[1])
 
 
-@kernel("float64(float64, float64, float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _hold(v: float, held: float, rising: F64, falling: F64) -> float:
     low = _envelope(v, rising)
     high = max(low, _envelope(v, falling))
     return max(low, min(high, held))
 
 
-@kernel("float64(float64, float64, float64[::1], float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _sum_of_plays(z: float, direct: float, thresholds: F64, weights: F64, memory: F64) -> float:
     total = direct * z
     for i in range(thresholds.size):
@@ -49,10 +49,7 @@ def _sum_of_plays(z: float, direct: float, thresholds: F64, weights: F64, memory
     return total
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], float64, float64[::1], float64[::1],"
-    " float64[::1], float64[::1])"
-)
+@kernel()
 def envelope_forward(
     v: F64,
     rising: F64,
@@ -78,11 +75,9 @@ def envelope_forward(
         memory[m + 1] = now
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1])"
-)
+@kernel()
 def envelope_outputs(
-    v: F64, rising: F64, falling: F64, thresholds: F64, memory: F64, out: F64
+    v: F64, rising: F64, falling: F64, thresholds: F64, memory: F64, out: F64_2D
 ) -> None:
     """Record z and each play's output by itself, as regressors for identification.
 
@@ -99,10 +94,7 @@ def envelope_outputs(
             out[k, i + 1] = memory[i]
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], float64, float64, float64, float64[::1],"
-    " float64[::1], float64[::1], float64[::1])"
-)
+@kernel()
 def envelope_inverse(
     y: F64,
     rising: F64,

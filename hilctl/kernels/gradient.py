@@ -12,7 +12,7 @@ orthogonalised one after the other. So a step or a bound of one does not affect 
 
 import math
 
-from hilctl.base.types import F64, I64, U32
+from hilctl.base.types import F64, F64_2D, I64, U32
 from hilctl.kernels.jit import kernel
 
 OFFSET, GAIN, WEIGHTS = range(3)  # places of the parameters; the weights go on from there
@@ -24,9 +24,7 @@ VALUE, FORM, GRADIENT, FOUND, TOTAL = range(5)  # rows of the state
 _FURTHEST = 4.0  # half spans from the middle: an input beyond is none that the steps are made for
 
 
-@kernel(
-    "float64(float64, float64, float64[::1], float64[::1], float64[::1], float64[::1])", inline=True
-)
+@kernel(inline=True)
 def _inverted(
     target: float, part: float, before: F64, after: F64, thresholds: F64, memory: F64
 ) -> float:
@@ -54,7 +52,7 @@ def _inverted(
     return last + sign * (way + left / slope)
 
 
-@kernel("float64(float64, float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _played(u: float, thresholds: F64, memory: F64) -> float:
     """Move the plays to an input; return it."""
     n = thresholds.size
@@ -64,31 +62,22 @@ def _played(u: float, thresholds: F64, memory: F64) -> float:
     return u
 
 
-@kernel(
-    "void(float64[::1], int64, float64[::1], float64[::1], float64[::1], float64[:, ::1],"
-    " float64[::1], float64[::1])"
-)
+@kernel()
 def adapted_input(
     input_um: F64,
     size: int,
     before: F64,
     after: F64,
     settings: F64,
-    table: F64,
+    table: F64_2D,
     thresholds: F64,
     memory: F64,
 ) -> None:
     """Convert requested displacements to a model's input, in place, by the operator's inverse.
 
-    Args:
-        input_um: float64[n]; values that are not finite stay, and move no play.
-        size: Samples over which the parameters change linearly, >= n.
-        before: float64[m], o, g and w_i before the first sample.
-        after: float64[m], the same after ``size`` samples.
-        settings: float64[8], see the names above.
-        table: float64[3, m], see :func:`adapt_block`.
-        thresholds: float64[m - 2], rising, in half spans.
-        memory: float64[m - 1], outputs of the plays and the previous input, in half spans.
+    Values of ``input_um``, float64[n], that are not finite stay, and move no play. ``before`` and
+    ``after`` ``size`` >= n samples, o, g and w_i are float64[m]; between, they change linearly. See
+    :func:`adapt_block` for the other arguments.
     """
     middle, half = settings[MIDDLE_UM], settings[HALF_UM]
     for k in range(input_um.size):
@@ -103,13 +92,9 @@ def adapted_input(
             input_um[k] = middle + half * _played(u, thresholds, memory) - offset
 
 
-@kernel(
-    "void(float64, float64[::1], float64[:, ::1], float64[:, ::1], float64[::1], float64[::1],"
-    " float64[::1])",
-    inline=True,
-)
+@kernel(inline=True)
 def _regressors(
-    x_um: float, settings: F64, table: F64, shape: F64, thresholds: F64, memory: F64, out: F64
+    x_um: float, settings: F64, table: F64_2D, shape: F64_2D, thresholds: F64, memory: F64, out: F64
 ) -> None:
     """Fill ``out`` (float64[m], um) with the regressors of the adapted parameters."""
     half = settings[HALF_UM]
@@ -125,20 +110,17 @@ def _regressors(
         out[j] = total
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[:, ::1], float64[:, ::1], float64[::1],"
-    " float64[::1], float64[::1], float64[::1], float64[:, ::1])"
-)
+@kernel()
 def regressor_sums(
     input_um: F64,
     settings: F64,
-    table: F64,
-    shape: F64,
+    table: F64_2D,
+    shape: F64_2D,
     thresholds: F64,
     memory: F64,
     found: F64,
     sums: F64,
-    products: F64,
+    products: F64_2D,
 ) -> None:
     """Add the regressors of an input to ``sums``, float64[m], and their products to ``products``.
 
@@ -152,7 +134,7 @@ def regressor_sums(
                 products[i, j] += found[i] * found[j]
 
 
-@kernel("float64(float64, float64[::1], int64[::1], int64)", inline=True)
+@kernel(inline=True)
 def _delayed(value: float, line: F64, places: I64, which: int) -> float:
     """Put a value into a delay line, and return its oldest one; the same value in a line of one."""
     at = places[which]
@@ -163,8 +145,8 @@ def _delayed(value: float, line: F64, places: I64, which: int) -> float:
     return oldest
 
 
-@kernel("float64(float64[::1], float64[:, ::1], float64)", inline=True)
-def _excess(found: F64, table: F64, count: float) -> float:
+@kernel(inline=True)
+def _excess(found: F64, table: F64_2D, count: float) -> float:
     """Return the square of the regressors relative to its mean, at least 1."""
     total = 0.0
     for j in range(found.size):
@@ -172,8 +154,8 @@ def _excess(found: F64, table: F64, count: float) -> float:
     return max(1.0, total / count)
 
 
-@kernel("void(int64, float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1])", inline=True)
-def _step(size: int, settings: F64, table: F64, shape: F64, state: F64) -> None:
+@kernel(inline=True)
+def _step(size: int, settings: F64, table: F64_2D, shape: F64_2D, state: F64_2D) -> None:
     """Move the parameters by ``size`` samples of the smoothed gradient, within their bounds.
 
     The dead zone applies to the part of the squared error that a gradient explains: below it, that
@@ -195,25 +177,21 @@ def _step(size: int, settings: F64, table: F64, shape: F64, state: F64) -> None:
         state[FORM, i] = form
 
 
-@kernel(
-    "int64(float64[::1], float64[::1], float64[::1], uint32[::1], float64[::1], float64[:, ::1],"
-    " float64[:, ::1], float64[::1], float64[::1], float64[::1], int64[::1], float64[::1],"
-    " float64[:, ::1])"
-)
+@kernel()
 def adapt_block(
     reference_um: F64,
     input_um: F64,
     displacement_um: F64,
     flags: U32,
     settings: F64,
-    table: F64,
-    shape: F64,
+    table: F64_2D,
+    shape: F64_2D,
     thresholds: F64,
     due: F64,
     shown: F64,
     places: I64,
     memory: F64,
-    state: F64,
+    state: F64_2D,
 ) -> int:
     """Compare a block's displacements with the references due, and step the parameters.
 

@@ -14,11 +14,11 @@ Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's
 
 import numpy as np
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
 
 
-@kernel("float64(float64, float64, float64, float64)")
+@kernel()
 def stop_step(v: float, v_previous: float, threshold: float, held: float) -> float:
     """Advance one stop operator by one sample (section 3.3); its output stays within the threshold.
 
@@ -27,20 +27,20 @@ def stop_step(v: float, v_previous: float, threshold: float, held: float) -> flo
     return min(threshold, max(-threshold, v - v_previous + held))
 
 
-@kernel("float64(float64, float64)", inline=True)
+@kernel(inline=True)
 def _widening(change: float, gain: float) -> float:
     rate = abs(change)
     return gain * rate if rate >= 0.0 else 0.0  # NaN: there is no previous input
 
 
-@kernel("void(float64, float64, float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _move_plays(v: float, widening: float, thresholds: F64, memory: F64) -> None:
     for i in range(thresholds.size):
         threshold = thresholds[i] + widening
         memory[i] = max(min(memory[i], v + threshold), v - threshold)
 
 
-@kernel("float64(float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _weigh(weights: F64, values: F64) -> float:
     total = 0.0
     for i in range(weights.size):
@@ -48,9 +48,7 @@ def _weigh(weights: F64, values: F64) -> float:
     return total
 
 
-@kernel(
-    "float64(float64, float64, float64[::1], float64[::1], float64[::1], float64[::1])", inline=True
-)
+@kernel(inline=True)
 def deadband_value(x: float, slope: float, d_up: F64, g_up: F64, d_down: F64, g_down: F64) -> float:
     """Evaluate the memoryless function Lambda, a weighted sum of deadband operators (6.6).
 
@@ -69,10 +67,7 @@ def deadband_value(x: float, slope: float, d_up: F64, g_up: F64, d_down: F64, g_
     return total
 
 
-@kernel(
-    "void(float64[::1], float64, float64[::1], float64[::1], float64[::1], float64[::1],"
-    " float64[::1])"
-)
+@kernel()
 def deadband_block(
     x: F64, slope: float, d_up: F64, g_up: F64, d_down: F64, g_down: F64, out: F64
 ) -> None:
@@ -81,10 +76,7 @@ def deadband_block(
         out[k] = deadband_value(x[k], slope, d_up, g_up, d_down, g_down)
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64, float64[::1], float64[::1], float64[::1],"
-    " float64[::1])"
-)
+@kernel()
 def play_sum_shared(
     v: F64, widening: F64, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64
 ) -> None:
@@ -100,23 +92,16 @@ def play_sum_shared(
         memory[thresholds.size] = now
 
 
-@kernel(
-    "void(float64[::1], float64, float64, float64[::1], float64[::1], float64[::1], float64[::1])"
-)
+@kernel()
 def play_sum(
     v: F64, rate_gain: float, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64
 ) -> None:
     """Sum weighted plays whose thresholds widen with the input's own rate (3.6, 5.5).
 
-    Args:
-        v: float64[n], input.
-        rate_gain: Widening for a change of 1 between samples: gamma times the sample rate; 0
-            for the rate-independent model.
-        direct: Weight of the input itself, a_0.
-        thresholds: float64[m], rising, in the unit of ``v``.
-        weights: float64[m].
-        memory: float64[m + 1], see the module's docstring.
-        out: float64[n], filled.
+    ``rate_gain`` is the widening for a change of 1 between samples: gamma times the sample rate; 0
+    for the rate-independent model. ``direct`` is the weight of the input itself, a_0.
+    ``thresholds`` (rising, in the unit of ``v``) and ``weights`` are float64[m], ``v`` and ``out``
+    float64[n].
     """
     for k in range(v.size):
         now = v[k]
@@ -125,8 +110,8 @@ def play_sum(
         memory[thresholds.size] = now
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1])")
-def play_outputs(v: F64, widening: F64, thresholds: F64, memory: F64, out: F64) -> None:
+@kernel()
+def play_outputs(v: F64, widening: F64, thresholds: F64, memory: F64, out: F64_2D) -> None:
     """Fill ``out`` (float64[n, m]) with the output of each play, as regressors for identification.
 
     ``widening`` is float64[n] >= 0, ``thresholds`` float64[m] in the unit of ``v`` (float64[n]).
@@ -138,7 +123,7 @@ def play_outputs(v: F64, widening: F64, thresholds: F64, memory: F64, out: F64) 
         memory[thresholds.size] = v[k]
 
 
-@kernel("void(float64[::1], float64, float64[::1], float64[::1], float64[::1], float64[::1])")
+@kernel()
 def stop_sum(v: F64, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64) -> None:
     """Sum weighted stop operators: the stop-operator-based compensator (3.11).
 
@@ -157,10 +142,7 @@ def stop_sum(v: F64, direct: float, thresholds: F64, weights: F64, memory: F64, 
         memory[thresholds.size] = now
 
 
-@kernel(
-    "void(float64[::1], float64, float64, float64[::1], float64[::1], float64, float64[::1],"
-    " float64[::1], float64[::1], float64[::1], float64[::1], float64[::1])"
-)
+@kernel()
 def integrated_forward(
     v: F64,
     rate_gain: float,
@@ -183,10 +165,7 @@ def integrated_forward(
     deadband_block(out, slope, d_up, g_up, d_down, g_down, out)
 
 
-@kernel(
-    "void(float64[::1], float64, float64[::1], float64[::1], float64[::1], float64[::1], float64,"
-    " float64, float64[::1], float64[::1], float64[::1], float64[::1])"
-)
+@kernel()
 def integrated_inverse(
     y: F64,
     slope: float,
@@ -210,10 +189,7 @@ def integrated_inverse(
     play_sum(out, rate_gain, direct, thresholds, weights, memory, out)
 
 
-@kernel(
-    "void(float64[::1], float64, float64, float64[::1], float64[::1], float64, float64,"
-    " float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], float64[::1])"
-)
+@kernel()
 def butterfly_forward(
     v: F64,
     rate_gain: float,
@@ -238,10 +214,7 @@ def butterfly_forward(
         out[k] = deadband_value(abs(out[k] + bias), slope, d_up, g_up, d_down, g_down)
 
 
-@kernel(
-    "void(float64[::1], float64, float64[::1], float64[::1], float64[::1], float64[::1], float64,"
-    " float64, float64, float64, float64[::1], float64[::1], float64[::1], float64[::1])"
-)
+@kernel()
 def butterfly_inverse(
     y: F64,
     slope: float,

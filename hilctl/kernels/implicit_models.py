@@ -32,12 +32,12 @@ _NARROWEST = 1e-15
 _FIRST_STEP = 1.0 / 1024.0
 
 
-@kernel("float64(float64, float64, float64)")
+@kernel()
 def _ridge(v: float, threshold: float, width: float) -> float:  # (1.3)
     return min(max(2.0 * (v - threshold) / width - 1.0, -1.0), 1.0)
 
 
-@kernel("float64(float64, float64, float64)")
+@kernel()
 def _time_to_zero(depth: float, opening: float, exponent: float) -> float:
     """Return the travel that returns z to 0 from ``depth`` on the other side."""
     if opening <= 0.0:
@@ -47,7 +47,7 @@ def _time_to_zero(depth: float, opening: float, exponent: float) -> float:
     return math.atan(depth * opening) / opening
 
 
-@kernel("float64(float64, float64, float64)")
+@kernel()
 def _depth_left(travel: float, opening: float, exponent: float) -> float:
     """Return the depth for a travel: the inverse of :func:`_time_to_zero`."""
     if opening <= 0.0:
@@ -57,7 +57,7 @@ def _depth_left(travel: float, opening: float, exponent: float) -> float:
     return math.tan(travel * opening) / opening
 
 
-@kernel("float64(float64, float64, float64, float64)")
+@kernel()
 def _closed(u: float, travel: float, closing: float, exponent: float) -> float:
     if exponent < 1.5:
         return u * math.exp(-travel * closing) - math.expm1(-travel * closing) / closing
@@ -65,7 +65,7 @@ def _closed(u: float, travel: float, closing: float, exponent: float) -> float:
     return math.tanh(math.atanh(level) + travel * closing) / closing
 
 
-@kernel("float64(float64, float64, float64, float64, float64)")
+@kernel()
 def bouc_wen_step(z: float, change: float, beta: float, gamma: float, exponent: float) -> float:
     """Advance Bouc-Wen's z by one change of the command, exactly, however large the change.
 
@@ -85,7 +85,7 @@ def bouc_wen_step(z: float, change: float, beta: float, gamma: float, exponent: 
     return sign * _closed(u, travel, closing, exponent)
 
 
-@kernel("float64(float64, float64[::1], float64[::1], float64[::1], float64[::1])")
+@kernel()
 def _preisach(v: float, memory: F64, thresholds: F64, values: F64, cells: F64) -> float:
     low, width, count = cells[0], cells[1], cells[2]
     stride = int(count) + 1
@@ -100,7 +100,7 @@ def _preisach(v: float, memory: F64, thresholds: F64, values: F64, cells: F64) -
     return total
 
 
-@kernel("float64(float64, float64[::1], float64[::1], float64[::1], float64[::1])")
+@kernel()
 def _kp(v: float, memory: F64, alpha: F64, beta: F64, weights: F64) -> float:
     width = weights[alpha.size]
     total = 0.0
@@ -110,13 +110,13 @@ def _kp(v: float, memory: F64, alpha: F64, beta: F64, weights: F64) -> float:
     return total
 
 
-@kernel("float64(float64, float64[::1], float64[::1])")
+@kernel()
 def _next_z(v: float, memory: F64, p: F64) -> float:
     previous = memory[1] if abs(memory[1]) >= 0.0 else 0.0
     return bouc_wen_step(memory[0], v - previous, p[2], p[3], p[4])
 
 
-@kernel("float64(int64, float64, float64[::1], UniTuple(float64[::1], 3))")
+@kernel()
 def _peek(kind: int, v: float, memory: F64, arrays: Arrays) -> float:
     """Return the displacement at a next command, in um, without moving the operators."""
     if kind == PREISACH:
@@ -127,7 +127,7 @@ def _peek(kind: int, v: float, memory: F64, arrays: Arrays) -> float:
     return float(p[0] * v - p[1] * _next_z(v, memory, p))
 
 
-@kernel("void(int64, float64, float64[::1], UniTuple(float64[::1], 3))")
+@kernel()
 def _settle(kind: int, v: float, memory: F64, arrays: Arrays) -> None:
     first, second, third = arrays
     if kind == PREISACH:
@@ -143,7 +143,7 @@ def _settle(kind: int, v: float, memory: F64, arrays: Arrays) -> None:
     memory[memory.size - 1] = v
 
 
-@kernel("void(float64[::1], int64, UniTuple(float64[::1], 3), float64[::1], float64[::1])")
+@kernel()
 def implicit_forward(v: F64, kind: int, arrays: Arrays, memory: F64, out: F64) -> None:
     """Run a model; see the module's docstring for its number, arrays and memory.
 
@@ -155,10 +155,7 @@ def implicit_forward(v: F64, kind: int, arrays: Arrays, memory: F64, out: F64) -
         _settle(kind, now, memory, arrays)
 
 
-@kernel(
-    "float64(int64, float64, UniTuple(float64, 2), UniTuple(float64, 2), float64, float64[::1],"
-    " UniTuple(float64[::1], 3))"
-)
+@kernel()
 def _between(
     kind: int,
     target: float,
@@ -185,10 +182,7 @@ def _between(
     return 0.5 * (near + far)
 
 
-@kernel(
-    "float64(int64, float64, UniTuple(float64, 2), float64, float64[::1],"
-    " UniTuple(float64[::1], 3))"
-)
+@kernel()
 def _root(
     kind: int,
     target: float,
@@ -216,10 +210,7 @@ def _root(
     return near
 
 
-@kernel(
-    "void(float64[::1], int64, UniTuple(float64[::1], 3), UniTuple(float64, 2), float64,"
-    " float64[::1], float64[::1])"
-)
+@kernel()
 def implicit_inverse(
     y: F64,
     kind: int,

@@ -45,7 +45,7 @@ _THERMAL = int(InterlockFlag.THERMAL)
 _TRACKING = int(InterlockFlag.TRACKING_ERROR)
 
 
-@kernel("int64(float64, float64[::1])", inline=True)
+@kernel(inline=True)
 def _invalid(displacement_um: float, settings: F64) -> int:
     """Return the flag of a reading outside the stroke or at an end of the sensor's range."""
     within = settings[STROKE_LOW] <= displacement_um <= settings[STROKE_HIGH]
@@ -53,7 +53,7 @@ def _invalid(displacement_um: float, settings: F64) -> int:
     return 0 if within and seen else _INVALID
 
 
-@kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _frozen(displacement_um: float, command: float, settings: F64, memory: F64) -> int:
     """Count the samples with a constant reading after the command has travelled.
 
@@ -71,7 +71,7 @@ def _frozen(displacement_um: float, command: float, settings: F64, memory: F64) 
     return _FROZEN if run > settings[FROZEN_SAMPLES] else 0
 
 
-@kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _deviating(measured: float, command: float, settings: F64, memory: F64) -> int:
     """Count the samples with a deviation of the measured command.
 
@@ -87,7 +87,7 @@ def _deviating(measured: float, command: float, settings: F64, memory: F64) -> i
     return _DEVIATION if run > settings[DEVIATION_SAMPLES] else 0
 
 
-@kernel("float64(float64, float64, float64, float64)", inline=True)
+@kernel(inline=True)
 def _warmed(heat: float, command: float, measured: float, warming: float) -> float:
     """Advance d(heat)/dt = (current^2 - heat) / tau by one sample of constant current."""
     load = command * command
@@ -96,14 +96,14 @@ def _warmed(heat: float, command: float, measured: float, warming: float) -> flo
     return heat + (load - heat) * warming
 
 
-@kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _too_hot(command: float, measured: float, settings: F64, memory: F64) -> int:
     heat = _warmed(memory[HEAT], command, measured, settings[WARMING])
     memory[HEAT] = heat
     return _THERMAL if heat > settings[BUDGET] else 0
 
 
-@kernel("int64(float64, float64, float64[::1], float64[::1])", inline=True)
+@kernel(inline=True)
 def _off_track(reference: float, displacement_um: float, settings: F64, memory: F64) -> int:
     """Count the samples with too large an error; without a reference (NaN) there is none."""
     run = memory[TRACKING_RUN] + 1.0
@@ -113,10 +113,7 @@ def _off_track(reference: float, displacement_um: float, settings: F64, memory: 
     return _TRACKING if run > settings[TRACKING_SAMPLES] else 0
 
 
-@kernel(
-    "int64(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], float64[::1],"
-    " uint32[::1])"
-)
+@kernel()
 def interlock_block(
     settings: F64,
     memory: F64,
@@ -126,22 +123,15 @@ def interlock_block(
     measured: F64,
     flags: U32,
 ) -> int:
-    """Check a block of samples against all interlocks.
+    """Check a block of samples against all interlocks; return the index of the first trip, or -1.
 
     A missing reading (NaN) is flagged, and trips if too many follow one another. It neither ends
     nor continues the time of the other conditions on readings.
 
-    Args:
-        settings: float64[14], see the names above.
-        memory: float64[9], updated in place; any cut into blocks gives the same bits.
-        command: float64[n], in A or V.
-        reference: float64[n], in um; NaN without one.
-        displacement_um: float64[n].
-        measured: float64[n], the measured command, in A or V; NaN without one.
-        flags: uint32[n]; the bits of invalid readings and of each tripped interlock are added.
-
-    Returns:
-        Index of the first trip, or -1.
+    Signals are float64[n]: the command and the measured one in A or V, the others in um; a
+    reference or measured command that is missing is NaN. The bits of invalid readings and of each
+    tripped interlock are added to ``flags``. ``settings`` is float64[14], ``memory`` float64[9],
+    updated in place; any cut into blocks gives the same bits.
     """
     first = -1
     for k in range(command.size):
@@ -164,7 +154,7 @@ def interlock_block(
     return first
 
 
-@kernel("float64(float64[::1], float64, float64, float64[::1])")
+@kernel()
 def heat_block(command: F64, warming: float, heat: float, out: F64) -> float:
     """Fill ``out`` with the heat of a coil after each command, as :func:`interlock_block` does.
 

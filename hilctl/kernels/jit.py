@@ -8,7 +8,9 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, partial, update_wrapper
-from typing import Any, TypeVar, cast
+from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
+
+from hilctl.base.types import F64, I64, U32
 
 DISABLED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}
 """Whether kernels are plain Python functions."""
@@ -28,32 +30,30 @@ def _numba() -> Any:
 class _Kernel:
     """A function that numba compiles, or loads from its cache, at the first use."""
 
-    def __init__(
-        self, function: Callable[..., object], signatures: tuple[str, ...], **options: object
-    ) -> None:
+    def __init__(self, function: Callable[..., object], **options: object) -> None:
         update_wrapper(self, function)
         self.py_func = function
         self._options = options
-        self._signatures = list(signatures)
         self._dispatcher: Any = None
 
     @property
     def dispatcher(self) -> Any:
-        """The compiled function, with the declared signatures only."""
+        """The compiled function, for the annotated types only."""
         if self._dispatcher is None:
             self._dispatcher = self._compile()
         return self._dispatcher
 
     def _compile(self) -> Any:
         njit = partial(_numba().njit, error_model="numpy", **self._options)
+        signature = _signature(self.py_func)
         cached = partial(njit, cache=True)
         with suppress(Exception):
-            return cached(self._signatures)(self.py_func)
+            return cached(signature)(self.py_func)
         with suppress(Exception):  # a damaged cache entry can raise any exception
             cached()(self.py_func).recompile()  # discards the entry
-            return cached(self._signatures)(self.py_func)
+            return cached(signature)(self.py_func)
         # No writable folder, a full disk, or a mistake in the kernel.
-        return njit(self._signatures)(self.py_func)
+        return njit(signature)(self.py_func)
 
     def __call__(self, *arguments: object) -> object:
         return (self._dispatcher or self.dispatcher)(*arguments)
@@ -62,10 +62,30 @@ class _Kernel:
         return self.py_func.__qualname__  # another process imports it
 
 
-def kernel(
-    *signatures: str, inline: bool = False, nogil: bool = False
-) -> Callable[[Function], Function]:
-    """Compile a function for the given signatures only, at its first use, and cache the result.
+_TYPES: dict[Any, str] = {
+    type(None): "void", bool: "boolean", int: "int64", float: "float64",
+    F64: "float64[::1]", I64: "int64[::1]", U32: "uint32[::1]",
+}  # fmt: skip
+
+
+def _signature(function: Callable[..., object]) -> str:
+    """Return numba's signature of a function, from its annotations."""
+    hints = get_type_hints(function, include_extras=True)
+    result = _type_name(hints.pop("return"))
+    return f"{result}({', '.join(map(_type_name, hints.values()))})"
+
+
+def _type_name(hint: Any) -> str:
+    """Return numba's name of a type; the annotation of an array has that of another shape."""
+    if get_origin(hint) is Annotated:
+        return str(hint.__metadata__[0])
+    if get_origin(hint) is tuple:
+        return f"Tuple(({', '.join(map(_type_name, get_args(hint)))},))"
+    return _TYPES[hint]
+
+
+def kernel(*, inline: bool = False, nogil: bool = False) -> Callable[[Function], Function]:
+    """Compile a function for its annotated types only, at its first use, and cache the result.
 
     Other argument types raise ``TypeError`` instead of compiling again during a run.
     ``error_model="numpy"`` omits the division checks. ``fastmath`` is off, so results have the same
@@ -76,7 +96,6 @@ def kernel(
     coverage) the function is returned unchanged.
 
     Args:
-        signatures: numba signatures, for example ``"void(float64[::1], float64[::1])"``.
         inline: Always inline it into the kernels that call it: for those called once per sample.
             Such a kernel must not use an array inside ``if`` or leave a loop by ``break``: numba
             then counts references to its arrays at every call, which takes longer than the work.
@@ -90,7 +109,7 @@ def kernel(
     def decorate(function: Function) -> Function:
         if DISABLED:
             return function
-        made = _Kernel(function, signatures, forceinline=inline, nogil=nogil)
+        made = _Kernel(function, forceinline=inline, nogil=nogil)
         return cast("Function", made)
 
     return decorate

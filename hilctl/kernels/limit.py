@@ -4,10 +4,7 @@ from hilctl.base.types import F64, U32
 from hilctl.kernels.jit import kernel
 
 
-@kernel(
-    "int64(float64[::1], float64, float64, float64, float64, uint32, uint32, uint32,"
-    " float64[::1], uint32[::1])"
-)
+@kernel()
 def limit_block(
     wanted: F64,
     previous: float,

@@ -25,7 +25,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.types import F64, I64
+from hilctl.base.types import F64, F64_2D, I64
 from hilctl.kernels.jit import kernel
 
 Tables: TypeAlias = tuple[F64, F64, F64, F64, F64]
@@ -33,18 +33,17 @@ Tables: TypeAlias = tuple[F64, F64, F64, F64, F64]
 p (c + 1)], those of a, b and c, float64[(2 d + 1) (c + 1)], and the grid: lowest edge, width of a
 cell, c, change of x in a window that counts as rate 1, most that R can be either way."""
 
-_TABLES = "UniTuple(float64[::1], 5)"
 _STEPS = 60
 _TOLERANCE_UM = 1e-6
 
 
-@kernel("float64(float64, float64)", inline=True)
+@kernel(inline=True)
 def _within(place: float, cells: float) -> float:
     """Return a place limited to the cells; 0 for NaN."""
     return min(place, cells) if place > 0.0 else 0.0
 
 
-@kernel(f"float64(float64, float64, float64[::1], {_TABLES})")
+@kernel()
 def _peek(x: float, fastest: float, memory: F64, tables: Tables) -> float:
     """Return R for a next x, without moving the operators."""
     thresholds, lengths, values, weights, grid = tables
@@ -74,7 +73,7 @@ def _peek(x: float, fastest: float, memory: F64, tables: Tables) -> float:
     return float(total + rate * (weights[c] + part * (weights[c + 1] - weights[c])))
 
 
-@kernel(f"void(float64, float64, float64[::1], {_TABLES})")
+@kernel()
 def _settle(x: float, given: float, memory: F64, tables: Tables) -> None:
     """Move all operators to a next x."""
     thresholds, lengths = tables[0], tables[1]
@@ -95,13 +94,13 @@ def _settle(x: float, given: float, memory: F64, tables: Tables) -> None:
     memory[last + 2] = given
 
 
-@kernel(f"float64(float64[::1], {_TABLES})", inline=True)
+@kernel(inline=True)
 def _fastest(memory: F64, tables: Tables) -> float:
     """Return the change that counts as rate 1; infinite at the first sample."""
     return tables[4][3] if abs(memory[memory.size - 1]) >= 0.0 else math.inf
 
 
-@kernel(f"void(float64[::1], {_TABLES}, float64[::1], float64[::1])")
+@kernel()
 def residual_forward(x: F64, tables: Tables, memory: F64, out: F64) -> None:
     """Return x + R[x] in ``out``, float64[n], for ``x``, float64[n], in um.
 
@@ -116,7 +115,7 @@ def residual_forward(x: F64, tables: Tables, memory: F64, out: F64) -> None:
             out[k] = np.nan
 
 
-@kernel(f"float64(float64, float64[::1], {_TABLES})")
+@kernel()
 def _root(y: float, memory: F64, tables: Tables) -> float:
     """Return the x of a y, by secants from the extrapolated x, within bounds."""
     fastest, most = _fastest(memory, tables), tables[4][4]
@@ -148,7 +147,7 @@ def _root(y: float, memory: F64, tables: Tables) -> float:
     return x
 
 
-@kernel(f"void(float64[::1], {_TABLES}, float64[::1], float64[::1])")
+@kernel()
 def residual_inverse(y: F64, tables: Tables, memory: F64, out: F64) -> None:
     """Find the x with x + R[x] = y; arguments as for :func:`residual_forward`."""
     for k in range(y.size):
@@ -160,16 +159,13 @@ def residual_inverse(y: F64, tables: Tables, memory: F64, out: F64) -> None:
             out[k] = np.nan
 
 
-@kernel(f"void(float64[::1], int64[::1], int64, {_TABLES}, float64[:, ::1])")
-def residual_columns(x: F64, rows: I64, window: int, tables: Tables, out: F64) -> None:
+@kernel()
+def residual_columns(x: F64, rows: I64, window: int, tables: Tables, out: F64_2D) -> None:
     """Fill in the terms that R is linear in, for identification: slopes in each cell, a, b and c.
 
-    Args:
-        x: float64[m], from rest.
-        rows: int64[N], samples that are filled in, rising.
-        window: Samples.
-        tables: See :data:`Tables`; only thresholds, lengths and grid are used.
-        out: float64[N, p c + (2 d + 1) (c + 1)], of zeros.
+    ``x`` is float64[m], from rest, and ``rows`` int64[N], the samples that are filled in, rising.
+    Only thresholds, lengths and grid of the tables are used. ``out``, float64[N, p c + (2 d + 1) (c
+    + 1)], is of zeros.
     """
     thresholds, lengths, _, _, grid = tables
     low, width, cells = grid[0], grid[1], int(grid[2])

@@ -216,19 +216,11 @@ class Interlocks:
         measured: F64,
         flags: U32,
     ) -> Trip | None:
-        """Check the next block, of n samples.
+        """Check the next block, of n samples; return its first trip, or None.
 
-        Args:
-            first_sample: Its first sample. Samples skipped before it count as time with a constant
-                output.
-            command: float64[n], in A or V.
-            reference: float64[n], in um; NaN without one.
-            displacement_um: float64[n].
-            measured: float64[n], measured command; NaN without one.
-            flags: uint32[n]; bits of tripped interlocks are added.
-
-        Returns:
-            The first trip in this block, or None.
+        Samples skipped before it count as time with a constant output. Signals are float64[n]: the
+        command and the measured one in A or V, the others in um; NaN is a missing reference or
+        measured command. The bits of tripped interlocks are added to ``flags``, uint32[n].
         """
         if first_sample > self._next_sample:
             self._hold(first_sample - self._next_sample)

@@ -6,7 +6,8 @@ from typing import Literal, TypeAlias
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl.kernels.generalised_duhem import Band, Losses, duhem_forward, duhem_inverse
+from hilctl.kernels.field import Losses
+from hilctl.kernels.generalised_duhem import Band, duhem_forward, duhem_inverse
 from hilctl.models.base import HysteresisModel, Operator, Weights
 from hilctl.models.effective_field import FieldLosses
 

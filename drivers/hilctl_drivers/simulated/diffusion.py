@@ -23,7 +23,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
 from hilctl_drivers.simulated.actuator_base import (
     ROD_LENGTH_M,
@@ -91,8 +91,10 @@ class DiffusionParameters(RodParameters):
         return np.diff(edges * edges)
 
 
-@kernel("void(float64[:, ::1], float64[:, ::1], float64[:, ::1], UniTuple(float64, 2), boolean)")
-def magnetise(shells: F64, pinned: F64, cells: F64, curve: tuple[float, float], stay: bool) -> None:
+@kernel()
+def magnetise(
+    shells: F64_2D, pinned: F64_2D, cells: F64_2D, curve: tuple[float, float], stay: bool
+) -> None:
     """Find the magnetisation of each shell at its field.
 
     Cells outside, shells inside, and choices in place of branches: so the compiler takes four
@@ -123,8 +125,8 @@ def magnetise(shells: F64, pinned: F64, cells: F64, curve: tuple[float, float], 
             pinned[i, j] = before if stay else at
 
 
-@kernel("float64(float64[:, ::1], float64[:, ::1], float64[:, ::1], float64)")
-def _correct(shells: F64, work: F64, conductance: F64, surface: float) -> float:
+@kernel()
+def _correct(shells: F64_2D, work: F64_2D, conductance: F64_2D, surface: float) -> float:
     """Do a step of Newton's method on the fields after a step of time; tridiagonal algorithm.
 
     Args:
@@ -161,17 +163,14 @@ def _correct(shells: F64, work: F64, conductance: F64, surface: float) -> float:
     return largest
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[:, ::1], float64[:, ::1], float64[:, ::1],"
-    " float64[:, ::1], float64[::1], UniTuple(float64, 2), UniTuple(float64, 2), float64)"
-)
+@kernel()
 def _follow(
     halves_a: F64,
     free_um: F64,
-    state: F64,
-    pinned: F64,
-    cells: F64,
-    conductance: F64,
+    state: F64_2D,
+    pinned: F64_2D,
+    cells: F64_2D,
+    conductance: F64_2D,
     areas: F64,
     coil: tuple[float, float],
     curve: tuple[float, float],

@@ -36,7 +36,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
 from hilctl_drivers.simulated.actuator_base import (
     ROD_LENGTH_M,
@@ -132,8 +132,8 @@ class DomainsParameters(RodParameters):
         return np.ascontiguousarray(np.array(columns).T)
 
 
-@kernel("void(float64, float64[:, ::1], UniTuple(float64, 6), float64[:, ::1])")
-def equilibrium(field: float, table: F64, energies: Energies, work: F64) -> None:
+@kernel()
+def equilibrium(field: float, table: F64_2D, energies: Energies, work: F64_2D) -> None:
     """Find the orientations and Boltzmann's fractions at a field.
 
     Args:
@@ -183,12 +183,9 @@ def equilibrium(field: float, table: F64, energies: Energies, work: F64) -> None
         work[3, i] = work[0, i] * (mean - work[3, i]) / spread
 
 
-@kernel(
-    "UniTuple(float64, 2)(float64, float64[:, ::1], float64[:, ::1], UniTuple(float64, 6),"
-    " float64[:, ::1])"
-)
+@kernel()
 def magnetise(
-    change: float, state: F64, table: F64, energies: Energies, work: F64
+    change: float, state: F64_2D, table: F64_2D, energies: Energies, work: F64_2D
 ) -> tuple[float, float]:
     """Return M / M_s at the end of a change of the field, and its slope, without making it.
 
@@ -220,15 +217,12 @@ def magnetise(
     return magnetisation, slope
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[:, ::1], float64[:, ::1], UniTuple(float64, 5),"
-    " UniTuple(float64, 6), float64)"
-)
+@kernel()
 def _follow(
     halves_a: F64,
     free_um: F64,
-    state: F64,
-    table: F64,
+    state: F64_2D,
+    table: F64_2D,
     coil: tuple[float, float, float, float, float],
     energies: Energies,
     length_um: float,

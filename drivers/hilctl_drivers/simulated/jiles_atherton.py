@@ -108,7 +108,7 @@ class GrowingLagParameters(JilesAthertonParameters):
     lag_growth_m_per_a: float = 1.1e-4
 
 
-@kernel("UniTuple(float64, 2)(float64)")
+@kernel()
 def langevin(x: float) -> tuple[float, float]:
     """Return L(x) = coth x - 1/x and its slope; by their series near 0, where they cancel."""
     if abs(x) < 0.05:
@@ -121,7 +121,7 @@ def langevin(x: float) -> tuple[float, float]:
     return coth - inverse, 1.0 - coth * coth + inverse * inverse
 
 
-@kernel("float64(float64, float64, float64, UniTuple(float64, 5))")
+@kernel()
 def susceptibility(field: float, magnetisation: float, sign: float, material: Material) -> float:
     """Return dM/dH of the published equations.
 
@@ -141,7 +141,7 @@ def susceptibility(field: float, magnetisation: float, sign: float, material: Ma
     return (irreversible + share) / (1.0 - coupling * share)
 
 
-@kernel("float64(float64, float64, float64, float64, UniTuple(float64, 3))")
+@kernel()
 def _advance(
     behind: float, lag: float, chi: float, step: float, losses: tuple[float, float, float]
 ) -> float:
@@ -159,10 +159,7 @@ def _advance(
     return math.copysign(root * root, behind)
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], UniTuple(float64, 3), UniTuple(float64, 5),"
-    " UniTuple(float64, 3), float64)"
-)
+@kernel()
 def _follow(
     halves_a: F64,
     free_um: F64,

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
 from hilctl_drivers.simulated.actuator_base import Plant
 
@@ -47,17 +47,14 @@ class PiezoParameters:
         return PiezoActuator(self, sample_rate_hz, seed)
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1],"
-    " UniTuple(float64, 6))"
-)
+@kernel()
 def _run(
     command: F64,  # float64[n], drive in V
     noise_um: F64,  # float64[n], of each reading
     displacement_um: F64,  # float64[n], filled with the sensor's readings
     drive_v: F64,  # float64[n], filled with the drive at the instant of each reading
     state: F64,  # float64[2]: drive in V, sensor output in um; updated
-    plays: F64,  # float64[3, m]: threshold, weight and output of each play operator; updated
+    plays: F64_2D,  # float64[3, m]: threshold, weight and output of each play operator; updated
     constants: tuple[float, float, float, float, float, float],
 ) -> None:
     """Read the sensor, output the command and advance one sample period; for every sample."""

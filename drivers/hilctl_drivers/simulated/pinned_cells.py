@@ -13,7 +13,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import ensure_compiled, kernel
 from hilctl_drivers.simulated.actuator_base import Coil, RodParameters, Rods
 
@@ -55,7 +55,7 @@ class PinnedCellsParameters(RodParameters):
         return np.stack([self.pinning_max_a_per_m * hardness, weights, np.zeros_like(hardness)])
 
 
-@kernel("float64(float64)")
+@kernel()
 def _langevin(x: float) -> float:
     """Return L(x) = coth x - 1/x; by its series near 0, where the difference cancels."""
     size = abs(x)
@@ -66,13 +66,13 @@ def _langevin(x: float) -> float:
     return math.copysign((1.0 + decay) / (1.0 - decay) - 1.0 / size, x)
 
 
-@kernel("float64(float64, float64, float64)")
+@kernel()
 def _field_rate(behind: float, lag: float, growth: float) -> float:
     """Return dH/dt where the field is ``behind`` its drive: slower the further behind it is."""
     return behind / (lag * (1.0 + growth * abs(behind)))
 
 
-@kernel("float64(float64, UniTuple(float64, 3), float64, float64, float64)")
+@kernel()
 def _advance_field(
     field: float, drive: tuple[float, float, float], step: float, lag: float, growth: float
 ) -> float:
@@ -85,8 +85,8 @@ def _advance_field(
     return field + step / 6.0 * (k1 + 2.0 * (k2 + k3) + k4)
 
 
-@kernel("float64(float64[:, ::1], float64, UniTuple(float64, 3))")
-def free_displacement(cells: F64, field: float, material: tuple[float, float, float]) -> float:
+@kernel()
+def free_displacement(cells: F64_2D, field: float, material: tuple[float, float, float]) -> float:
     """Let the pinned cells follow ``field`` and return the unloaded displacement in um.
 
     M = sum w L(h / a), x = lambda (M^2 + b M^4).
@@ -106,15 +106,12 @@ def free_displacement(cells: F64, field: float, material: tuple[float, float, fl
     return strain * square * (1.0 + quartic * square)
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], float64[:, ::1], UniTuple(float64, 5),"
-    " UniTuple(float64, 3))"
-)
+@kernel()
 def _follow(
     halves_a: F64,
     free_um: F64,
     state: F64,
-    cells: F64,
+    cells: F64_2D,
     coil: tuple[float, float, float, float, float],
     material: tuple[float, float, float],
 ) -> None:

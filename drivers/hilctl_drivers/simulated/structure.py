@@ -6,7 +6,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.dynamics import exponential
 from hilctl.kernels.jit import kernel
 
@@ -34,16 +34,13 @@ def motion(modes: Sequence[Mode], sensor_bandwidth_hz: float, step_s: float) -> 
     return step
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1], float64,"
-    " UniTuple(float64, 2), int64)"
-)
+@kernel()
 def respond(
     free_um: F64,  # float64[n substeps], displacement of the rods at the end of each step
     noise_um: F64,  # float64[n], of each reading
     displacement_um: F64,  # float64[n], filled with the sensor's readings
     mechanics: F64,  # float64[m], updated
-    motion: F64,  # float64[m - 2, m], exact step for a free displacement that changes linearly
+    motion: F64_2D,  # float64[m - 2, m], exact step for a free displacement that changes linearly
     rest_um: float,  # free displacement at rest
     sensor: tuple[float, float],  # one ADC code and the range, in um
     substeps: int,  # in a sample period

@@ -15,7 +15,7 @@ import numpy as np
 
 from hilctl.base.device import DeviceOptions, VoltageLimit
 from hilctl.base.strict import Field
-from hilctl.base.types import F64
+from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import ensure_compiled, kernel
 from hilctl_drivers.simulated.actuator_base import CHUNK, Coil, Plant, RodParameters
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
@@ -24,7 +24,7 @@ from hilctl_drivers.simulated.structure import Mode, motion, respond
 Amplification: TypeAlias = tuple[float, float, float, float, float, float]
 
 
-@kernel("float64(float64, float64, float64, UniTuple(float64, 2))")
+@kernel()
 def _toward(start: float, target: float, left: float, limit: tuple[float, float]) -> float:
     """Return the current in A after some time: to the target by first order, within the voltage.
 
@@ -38,7 +38,7 @@ def _toward(start: float, target: float, left: float, limit: tuple[float, float]
     return max(driven - push, min(driven + push, free))
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1], float64[::1], UniTuple(float64, 6), int64)")
+@kernel()
 def amplify(
     command: F64, current_a: F64, halves_a: F64, state: F64, amplifier: Amplification, substeps: int
 ) -> None:
@@ -71,8 +71,8 @@ def amplify(
     state[0] = current
 
 
-@kernel("void(float64[::1], float64[:, ::1], float64)")
-def creep(free_um: F64, elements: F64, rest_um: float) -> None:
+@kernel()
+def creep(free_um: F64, elements: F64_2D, rest_um: float) -> None:
     """Add the creep to the free displacement, float64[n] at the end of each step.
 
     ``elements`` is float64[3, m]: share, part reached in a step, and displacement from rest of each
@@ -85,7 +85,7 @@ def creep(free_um: F64, elements: F64, rest_um: float) -> None:
             free_um[k] += elements[0, i] * elements[2, i]
 
 
-@kernel("void(float64[::1], float64[::1], float64[::1], UniTuple(float64, 5), int64)")
+@kernel()
 def warm(
     halves_a: F64,  # float64[2 n substeps + 1], see ``amplify``
     growth_um: F64,  # float64[n], added to

@@ -23,7 +23,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import ensure_compiled, kernel
 from hilctl_drivers.simulated.actuator_base import CHUNK, Plant
 from hilctl_drivers.simulated.structure import motion, respond
@@ -77,16 +77,13 @@ class SwitchingParameters:
         )
 
 
-@kernel(
-    "void(float64[::1], float64[::1], float64[::1], float64[::1], float64[:, ::1],"
-    " UniTuple(float64, 5), int64)"
-)
+@kernel()
 def _switch(
     command: F64,  # float64[n], drive in V
     drive_v: F64,  # float64[n], filled with the drive at the instant of each reading
     free_um: F64,  # float64[n substeps], filled with the displacement at the end of each step
     state: F64,  # float64[1], drive in V; updated
-    domains: F64,  # float64[4, m], see ``SwitchingParameters.domains``; the last row is updated
+    domains: F64_2D,  # float64[4, m], see ``SwitchingParameters.domains``; the last row is updated
     constants: tuple[float, float, float, float, float],
     substeps: int,
 ) -> None:

@@ -6,11 +6,11 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.types import F64, I64
+from hilctl.base.types import F64, F64_2D, I64
 from hilctl.kernels.jit import kernel
 
 
-@kernel("int64(float64[::1], float64[::1], float64, float64, int64, int64, int64[::1])", nogil=True)
+@kernel(nogil=True)
 def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int, out: I64) -> int:
     """Find samples between which straight lines approximate two signals, float64[n] each.
 
@@ -42,9 +42,9 @@ def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int
     return count
 
 
-@kernel("void(float64[:, ::1], int64[::1], float64, float64, float64, float64[::1])", nogil=True)
+@kernel(nogil=True)
 def bare_displacement(
-    derivatives: F64, kept: I64, late: float, slope_gain: float, bend_gain: float, out: F64
+    derivatives: F64_2D, kept: I64, late: float, slope_gain: float, bend_gain: float, out: F64
 ) -> None:
     """Fill in y + slope_gain y' + bend_gain y'' ``late`` samples after each of ``kept``."""
     # derivatives: float64[3, n], y, y' and y''; the last sample is repeated.
@@ -58,7 +58,7 @@ def bare_displacement(
         out[i] = a + part * (b - a)
 
 
-@kernel("int64(float64[::1], float64, int64[::1])")
+@kernel()
 def turning_points(u: F64, distance: float, out: I64) -> int:
     """Fill in turns of a path, and samples at most ``distance`` apart; return their number."""
     out[0] = 0
@@ -74,7 +74,7 @@ def turning_points(u: F64, distance: float, out: I64) -> int:
     return count
 
 
-@kernel("void(float64[::1], float64, float64[::1])")
+@kernel()
 def swings(y: F64, turn: float, out: F64) -> None:
     """Fill in the swing between turns of more than ``turn`` around each sample: float64[n]."""
     first = last = 0  # the last turn, and the furthest sample since
@@ -92,7 +92,7 @@ def swings(y: F64, turn: float, out: F64) -> None:
     out[first:] = abs(y[last] - y[first])
 
 
-@kernel("int64(float64[::1], int64[::1], int64[::1], int64[::1])", nogil=True)
+@kernel(nogil=True)
 def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
     """Fill in rows and turns, and the place of each row among them; return their number."""
     count = row = 0
@@ -110,7 +110,7 @@ def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
     return count
 
 
-@kernel("void(float64, float64, float64, float64, float64[::1])")
+@kernel()
 def _add_splines(u: float, lowest: float, width: float, sign: float, out: F64) -> None:
     """Add the integral of each quadratic spline from the lowest u to this one, times a sign."""
     pieces = out.size - 2
@@ -128,7 +128,7 @@ def _add_splines(u: float, lowest: float, width: float, sign: float, out: F64) -
     out[j + 2] += width * sign * (cube / 6.0 + 0.5 * above)
 
 
-@kernel("UniTuple(float64, 2)(float64, float64, float64, float64[::1], float64[::1])")
+@kernel()
 def _risen(u: float, lowest: float, width: float, s: F64, edges: F64) -> tuple[float, float]:
     """Return the integral of splines with weights s up to u, and their sum there."""
     # edges: float64[c - 1], integrals at the edges of pieces.
@@ -143,8 +143,8 @@ def _risen(u: float, lowest: float, width: float, s: F64, edges: F64) -> tuple[f
     return edges[j] + width * (value + 0.5 * s[j + 2] * third + slope * beyond), slope
 
 
-@kernel("void(float64[:, ::1], float64, float64, int64, float64[:, ::1])", nogil=True)
-def play_columns(held: F64, lowest: float, width: float, splines: int, out: F64) -> None:
+@kernel(nogil=True)
+def play_columns(held: F64_2D, lowest: float, width: float, splines: int, out: F64_2D) -> None:
     """Fill in the output of plays with a quadratic B-spline as slope, for their positions.
 
     Positions are float64[p, N]. The c >= 3 splines have c - 2 pieces of equal width from ``lowest``
@@ -160,13 +160,15 @@ def play_columns(held: F64, lowest: float, width: float, splines: int, out: F64)
             _add_splines(held[i, row], lowest, width, 1.0, columns)
 
 
-@kernel(
-    "void(float64[:, ::1], float64[:, ::1], float64, float64, float64[:, ::1], float64[::1],"
-    " float64[:, ::1])",
-    nogil=True,
-)
+@kernel(nogil=True)
 def plays_given(
-    held: F64, change: F64, lowest: float, width: float, weights: F64, total: F64, by: F64
+    held: F64_2D,
+    change: F64_2D,
+    lowest: float,
+    width: float,
+    weights: F64_2D,
+    total: F64,
+    by: F64_2D,
 ) -> None:
     """Compute the total output of plays with known weights, float64[p, c], and its derivatives.
 

@@ -2,6 +2,7 @@
 
 import os
 import pickle
+from typing import Annotated
 
 import numba
 import numpy as np
@@ -123,17 +124,17 @@ def double(value: float) -> float:
     return 2.0 * value
 
 
-double_kernel = jit.kernel("float64(float64)")(double)
+double_kernel = jit.kernel()(double)
 
 
-@jit.kernel("float64(int64)")
+@jit.kernel()
 def twice(value: int) -> float:
     return double_kernel(value)
 
 
 def stats_of_first_call(function=double):
     """Return numba's cache statistics of a new kernel, called once."""
-    made = jit.kernel("float64(float64)")(function)
+    made = jit.kernel()(function)
     assert made(1.5) == 3.0
     return made.dispatcher.stats
 
@@ -145,7 +146,7 @@ def test_second_process_loads_the_kernel_from_the_cache(cache):
 
 def test_compiled_without_a_cache_folder():
     names = {}
-    exec("def double(value):\n    return 2.0 * value", names)
+    exec("def double(value: float) -> float:\n    return 2.0 * value", names)
     assert not stats_of_first_call(names["double"]).cache_path
 
 
@@ -194,14 +195,17 @@ def test_kernels_are_cached_in_memory_if_no_other_folder_is_writable(
 
 
 def test_mistake_in_a_kernel_is_raised(cache):
-    wrong = jit.kernel("float64(unicode_type)")(double)
+    def halved(value: Annotated[float, "unicode_type"]) -> float:
+        return 0.5 * value
+
+    wrong = jit.kernel()(halved)
     for _ in range(2):
         with pytest.raises(numba.TypingError):
             wrong(1.5)
 
 
 def test_nothing_is_compiled_before_the_first_use(cache):
-    deferred = jit.kernel("float64(float64)")(double)
+    deferred = jit.kernel()(double)
     assert not list(cache.iterdir())
     jit.ensure_compiled(deferred, double, None)
     compiled = deferred.dispatcher
@@ -220,4 +224,4 @@ def test_another_process_gets_the_kernel_by_its_name():
 
 
 def test_called_with_a_type_that_casts(cache):
-    assert jit.kernel("float64(float64)")(double)(2) == 4.0
+    assert jit.kernel()(double)(2) == 4.0
