@@ -76,7 +76,8 @@ dt { font-weight: 600; break-after: avoid; } dd { margin: 0 0 .4rem 1rem; break-
 _HEAD = """<!DOCTYPE html>
 <html lang="en"><head><meta charset="utf-8">
 <meta name="viewport" content="width=device-width, initial-scale=1">
-<title>{title}</title><style>{css}</style></head><body><main>"""
+<title>{title}</title><style>{css}</style></head><body><main>
+<h1>{title}</h1>"""
 
 
 def write_page(page: str, path: Path) -> None:
@@ -85,8 +86,9 @@ def write_page(page: str, path: Path) -> None:
 
 
 def document(title: str, body: Iterable[str]) -> str:
-    """Return a page; title and body are HTML."""
-    return "\n".join((_HEAD.format(title=title, css=_CSS), *body, "</main></body></html>\n"))
+    """Return a page with its title as heading; empty parts of the body, in HTML, are omitted."""
+    head = _HEAD.format(title=text(title), css=_CSS)
+    return "\n".join((head, *filter(None, body), "</main></body></html>\n"))
 
 
 def text(plain: str, *, lines: bool = False) -> str:
@@ -190,10 +192,11 @@ def details(heading: str, plain: str) -> str:
     return f"<details><summary>{text(heading)}</summary><pre>{shown}</pre></details>"
 
 
-def definitions(heading: str, terms: Sequence[tuple[str, str]]) -> str:
-    """Return terms and definitions."""
-    body = "".join(f"<dt>{text(term)}</dt><dd>{text(meaning)}</dd>" for term, meaning in terms)
-    return f"<h2>{text(heading)}</h2><dl>{body}</dl>"
+def definitions(*terms: str) -> str:
+    """Return the definitions of terms in the order of the list; empty without any."""
+    known = (each for each in DEFINITIONS.items() if each[0] in terms)
+    body = "".join(f"<dt>{text(term)}</dt><dd>{text(meaning)}</dd>" for term, meaning in known)
+    return f"<h2>Definitions</h2><dl>{body}</dl>" if body else ""
 
 
 DEFINITIONS = {
@@ -249,8 +252,3 @@ DEFINITIONS = {
     "r²": "Share of the variance explained by a linear fit.",
     "lateness": "Time from a tick's deadline to its exchange; 99 % of the ticks are within p99.",
 }
-
-
-def definitions_of(*terms: str) -> list[tuple[str, str]]:
-    """Return terms and definitions, in order."""
-    return [each for each in DEFINITIONS.items() if each[0] in terms]

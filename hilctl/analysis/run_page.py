@@ -10,7 +10,6 @@ import numpy as np
 
 from hilctl.analysis import html, plots, run_metrics
 from hilctl.analysis.figure_layout import FigureSpec
-from hilctl.analysis.html import definitions_of
 from hilctl.analysis.report import worst_segment
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import ConfigError
@@ -43,7 +42,6 @@ def write_html(
 @np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
 def page(recording: Recording, report: RunReport, before: Recording | None = None) -> str:
     """Return the page of a run as HTML."""
-    title = html.text(report.name or "run")
     terms = ["average cycle"] if report.steady_cycles else []
     if report.peak_hysteresis_percent is not None:
         terms += ["peak hysteresis", "noise floor", "loop area"]
@@ -59,7 +57,6 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
     ]
     terms += [name for name, _ in samples if name == "lateness"]
     body = [
-        f"<h1>{title}</h1>",
         html.paragraph(report.path, "file"),
         *_end(recording, report),
         html.paragraph(headline(report), "headline"),
@@ -74,12 +71,12 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
         "</div>",
         *_segments(report),
         *_events(recording.events),
-        html.definitions("Definitions", definitions_of(*terms)) if terms else "",
+        html.definitions(*terms),
         html.details("Experiment", recording.experiment_yaml) if recording.experiment_yaml else "",
         html.details("Model", recording.model_yaml) if recording.model_yaml else "",
         *(html.details(name, text) for name, text in sorted(recording.device_files.items())),
     ]
-    return html.document(title, filter(None, body))
+    return html.document(report.name or "run", body)
 
 
 def headline(report: RunReport) -> str:

@@ -19,7 +19,6 @@ _STYLES = ("-", "--", ":")
 def comparison_page(comparison: Comparison) -> str:
     """Return the page as HTML."""
     body = [
-        "<h1>Comparison of models</h1>",
         html.paragraph(", ".join(comparison.sources), "file"),
         html.grid(headings(comparison), table_rows(comparison)),
         *map(html.paragraph, notes(comparison)),

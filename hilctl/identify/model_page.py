@@ -36,7 +36,7 @@ def identification_page(found: Identification) -> str:
     """Return the page as HTML."""
     fit = found.fit
     unit = fit.model.input_unit
-    body = _head("Identified model", fit.model, [*summary(found), fit.model.provenance.method])
+    body = _head(fit.model, [*summary(found), fit.model.provenance.method])
     body += errors_by_stroke(found.verdict)
     if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on data not fitted</h2>"]
@@ -54,10 +54,10 @@ def identification_page(found: Identification) -> str:
     return html.document("Identified model", [*body, html.details("Model", dump_model(fit.model))])
 
 
-def _head(title: str, model: HysteresisModel, lines: Sequence[str]) -> list[str]:
-    """Return title, sources and results."""
+def _head(model: HysteresisModel, lines: Sequence[str]) -> list[str]:
+    """Return sources and results."""
     source = html.paragraph(", ".join(model.provenance.source), "file")
-    return [f"<h1>{title}</h1>", source, *map(html.paragraph, lines)]
+    return [source, *map(html.paragraph, lines)]
 
 
 def errors_by_stroke(verdict: Verdict) -> list[str]:
@@ -143,7 +143,7 @@ def refinement_page(found: Refinement) -> str:
     """Return the page as HTML."""
     after, unit = found.choice.after, found.model.input_unit
     body = [
-        *_head("Refined model", found.model, [str(found), *worse_lines(found), after.how]),
+        *_head(found.model, [str(found), *worse_lines(found), after.how]),
         "<h2>Errors on runs not fitted</h2>",
         html.grid(*refinement_table(found)),
         "<h2>Errors by stroke</h2>",

@@ -67,7 +67,7 @@ def deadband_value(x: float, slope: float, d_up: F64, g_up: F64, d_down: F64, g_
     return total
 
 
-@kernel()
+@kernel(inline=True)
 def deadband_block(
     x: F64, slope: float, d_up: F64, g_up: F64, d_down: F64, g_down: F64, out: F64
 ) -> None:
@@ -92,7 +92,7 @@ def play_sum_shared(
         memory[thresholds.size] = now
 
 
-@kernel()
+@kernel(inline=True)
 def play_sum(
     v: F64, rate_gain: float, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64
 ) -> None:

@@ -165,10 +165,8 @@ def write_responses(responses: Sequence[FrequencyResponse], path: Path) -> None:
     tables = zip(names or ["value"], map(fit_rows, responses), strict=True)
     lines = [html.section(each.path.stem, html.grid(*line_table(each))) for each in responses]
     body = [
-        "<h1>Frequency response</h1>",
         html.paragraph(", ".join(str(each.path) for each in responses), "file"),
         *html.results([response_sheet(responses, names)], "Fit", list(tables), lines),
+        html.definitions("coherence", "lines not excited"),
     ]
-    terms = html.definitions_of("coherence", "lines not excited")
-    body.append(html.definitions("Definitions", terms))
     html.write_page(html.document("Frequency response", body), path)

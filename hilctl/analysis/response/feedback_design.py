@@ -213,7 +213,6 @@ def write_design(design: FeedbackDesign, path: Path) -> None:
     tables = [(name, zip(headings, figures, strict=True)) for name, *figures in loops]
     section = html.details("Proposed section of the experiment", design.to_yaml())
     body = [
-        "<h1>Feedback</h1>",
         html.paragraph(str(design.path), "file"),
         *html.results([open_loop_sheet(design)], "Margins", tables, [section]),
     ]

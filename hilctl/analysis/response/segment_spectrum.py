@@ -308,9 +308,8 @@ def write_spectra(found: Sequence[SegmentSpectrum], path: Path) -> None:
     terms += ["Allan deviation", "bias instability"] if any(each.rest for each in found) else []
     terms += ["THD"] if any(each.sine for each in found) else []
     body = [
-        "<h1>Spectrum</h1>",
         html.paragraph(", ".join(dict.fromkeys(str(each.path) for each in found)), "file"),
         *html.results(spectrum_sheets(found), "Results", list(tables)),
-        html.definitions("Definitions", html.definitions_of(*terms)),
+        html.definitions(*terms),
     ]
     html.write_page(html.document("Spectrum", body), path)

@@ -164,14 +164,12 @@ def write_characterisation(found: Characterisation, path: Path) -> None:
 
 def characterisation_page(found: Characterisation) -> str:
     """Return the page as HTML."""
-    title = f"{found.experiment}: {found.device}"
     rows = [
         (each.name, each.purpose, f"{each.seconds:.1f}", each.text, Path(each.recording).name)
         for each in found.steps
     ]
     body = [
-        f"<h1>{html.text(title)}</h1>",
-        *([html.paragraph(found.problem, "note")] if found.problem else []),
+        html.paragraph(found.problem, "note") if found.problem else "",
         *_held_out(found),
         "<h2>Measured</h2>",
         html.grid(("quantity", "value"), figure_rows(found)),
@@ -180,7 +178,7 @@ def characterisation_page(found: Characterisation) -> str:
         "<h2>Steps</h2>",
         html.grid(("step", "purpose", "time, s", "result", "recording"), rows),
     ]
-    return html.document(html.text(title), body)
+    return html.document(f"{found.experiment}: {found.device}", body)
 
 
 def _held_out(found: Characterisation) -> list[str]:

@@ -6,7 +6,6 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.analysis import html
-from hilctl.analysis.html import definitions_of
 from hilctl.base.formatting import finite, quantity
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.plots import sheets_of
@@ -43,7 +42,6 @@ def series_page(series: RunSeries) -> str:
     first, *more = headline(series)
     sheets, left_out = sheets_of(series), len(series.runs) - MOST_ROWS
     body = [
-        f"<h1>{html.text(series.name)}</h1>",
         html.paragraph(" ".join((first, *more[:2])), "headline"),
         html.paragraph(" ".join(more[2:])) if more[2:] else "",
         *(html.paragraph(f"Not read: {problem}", "bad") for problem in series.missing),
@@ -57,9 +55,9 @@ def series_page(series: RunSeries) -> str:
         if left_out > 0
         else "",
         *_made_of(series),
-        html.definitions("Definitions", _terms(series)),
+        html.definitions(*_terms(series)),
     ]
-    return html.document(html.text(series.name), filter(None, body))
+    return html.document(series.name, body)
 
 
 def _simulated(series: RunSeries) -> Iterator[str]:
@@ -162,15 +160,15 @@ def _several(texts: Iterable[str]) -> str:
     return ", ".join(dict.fromkeys(texts))
 
 
-def _terms(series: RunSeries) -> list[tuple[str, str]]:
-    terms = ["average cycle", "peak hysteresis", "loop area"]
+def _terms(series: RunSeries) -> list[str]:
+    terms = ["average cycle", "peak hysteresis", "loop area", "r²"]
     if PEAK_ERROR.of(series.done):
         terms.append("peak and rms error")
     if MODEL_ERROR.of(series.done):
         terms.append("model error")
     if ASYMMETRY.of(series.done) and any(each.name == "amplitude" for each in series.dimensions):
         terms.append("asymmetry")
-    return definitions_of(*terms, "r²")
+    return terms
 
 
 def series_mapping(series: RunSeries) -> dict[str, Any]:
