@@ -79,11 +79,6 @@ class TestExperiment:
 
     INTEGRAL = "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 1.0}"
 
-    def test_integral_takes_blocks(self, tmp_path):
-        (tmp_path / "model.yaml").write_text(MODEL)
-        checked = check(resolve(Document("e", EXPERIMENT), tmp_path, ["block=50", self.INTEGRAL]))
-        assert checked.records_input
-
     @pytest.mark.parametrize(("settings", "model", "rule"), [
         (("block=50", "{b: 3.2}"), MODEL, "must be <= 3.121 Hz"),
         (("block=1", "{b: 5.1}"), MODEL, "must be <= 5 Hz"),

@@ -65,10 +65,6 @@ def test_without_a_budget_nothing_is_waited_for(experiment):
     assert cold.pause_s(run, 5.0) == 0.0
 
 
-def test_a_cold_coil_runs_at_once(coil, held):
-    assert coil.pause_s(held(2.0, 1.0), 100.0) == 0.0
-
-
 def test_the_pause_is_just_long_enough(coil, held, config):
     run = held(2.5, 1.0)
     coil.ran(run, 101.0)
@@ -97,11 +93,6 @@ def test_it_cools_to_what_is_asked_for(coil, held):
     coil.ran(held(2.5, 1.0), 101.0)
     pause_s = coil.pause_s(held(0.1, 0.1), 101.0, 0.2)
     assert coil.heat_a2(101.0 + pause_s) == pytest.approx(0.04)
-
-
-def test_time_that_passes_anyway_is_no_pause(coil, held):
-    coil.ran(held(2.5, 1.0), 101.0)
-    assert coil.pause_s(held(2.5, 1.0), 200.0) == 0.0
 
 
 def test_a_run_that_never_fits_is_waited_for_no_longer_than_for_a_cold_coil(coil, held):

@@ -14,7 +14,7 @@ from hilctl.experiment import device_rules
 from hilctl.experiment.device_rules import calibration_warnings, interlock_context, pace_warnings
 from hilctl.experiment.load import load_experiment, resolve
 from hilctl.experiment.preflight import check
-from hilctl.loop.interlocks import Interlocks, InterlockSettings
+from hilctl.loop.interlocks import Interlocks
 from tests.published import terfenol_rdpi
 from tests.unit.base.test_calibration import CALIBRATION
 
@@ -66,10 +66,6 @@ class TestContext:
         assert context.sensor_um == (-125.0, 125.0)
         assert (context.unit, context.safe) == ("A", 0.5)
         assert context.frozen_travel == pytest.approx(0.02 * 14.0)
-
-    def test_nothing_is_on_without_a_key(self):
-        limits = loaded(CURRENT).config.limits
-        assert all(getattr(limits, key) is None for key in InterlockSettings.model_fields)
 
     def test_in_volt(self):
         made = loaded(VOLTAGE, "limits.measured_deviation_v=0.3", "limits.frozen_s=0.1")
@@ -142,25 +138,6 @@ class TestConsistency:
         interlocks = made.config.interlocks
         assert (interlocks.tracking_error_um, interlocks.tracking_s) == (error_um, time_s)
 
-    def test_all_of_them_together_are_fine(self):
-        text = CURRENT.replace("unit: A", "unit: um")
-        settings = (
-            *BUDGET,
-            "limits.tracking_error_um=5.0",
-            "limits.tracking_s=0.1",
-            "limits.frozen_s=0.1",
-            "limits.frozen_um=0.01",
-            "limits.measured_deviation_a=0.5",
-            "limits.deviation_s=0.01",
-        )
-        path = Path(__file__).parents[3] / "configs"
-        made = resolve(
-            Document("x.yaml", text.replace("none", "{model: models/terfenol_omega.yaml}")),
-            path,
-            settings,
-        )
-        assert check(made).forecast.heating_rms_a > 0.1
-
 
 class TestHeatForecast:
     def test_without_a_budget(self):
@@ -208,9 +185,6 @@ class TestHeatForecast:
         none, flags = np.full(4000, np.nan), np.zeros(4000, dtype=np.uint32)
         trip = interlocks.check(0, reference, none, np.zeros(4000), none, flags)
         assert (trip.code, trip.sample) == ("thermal", 3230)
-
-    def test_budget_that_is_just_kept(self):
-        check(loaded(CURRENT, "limits.rms_current_a=4.12", BUDGET[1]))
 
     def test_commands_of_the_inverse_count(self):
         made = loaded(CURRENT, *BUDGET)
@@ -267,10 +241,6 @@ def test_the_text_says_what_to_do():
     assert "larger block" in text
     (text,) = warned("block=1", buffered=False)
     assert "lower rate" in text
-
-
-def test_a_device_that_keeps_the_pace_needs_no_timer():
-    assert warned("block=1", latency_blocks=2) == ()
 
 
 def test_a_check_tells():

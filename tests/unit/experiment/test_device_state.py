@@ -384,11 +384,6 @@ class TestCheck:
         assert begun.begins == words
         assert begun.run_id == ("before" if "old" in setting else "")
 
-    def test_without_a_compensator(self, folder):
-        folder.record("new")
-        plain = folder.loaded("compensator=none", "waveform.unit=A")
-        assert check(plain).begun.begins == ""
-
 
 HOT = ["limits.rms_current_a=3.0", "limits.thermal_time_constant_s=20.0"]
 ENDED = datetime.fromisoformat("2026-01-01T00:01:00+00:00")
@@ -418,16 +413,6 @@ class TestHeat:
         assert self.left(folder, 0.0) == 4.0
         assert self.left(folder, 20.0) == pytest.approx(4.0 / np.e)
         assert self.left(folder, 1e6, "safe.value=1.0") == pytest.approx(1.0)
-
-    def test_a_clock_that_was_set_back_leaves_it_hot(self, folder):
-        folder.begin("gone", coil=coil(4.0))
-        assert self.left(folder, -1e6) == 4.0
-
-    def test_without_a_budget_or_a_past_there_is_none(self, folder):
-        folder.begin("gone", coil=coil(4.0))
-        assert heat_before(folder.loaded(), ENDED_S) == 0.0
-        assert heat_before(folder.loaded(*HOT, holds=()), ENDED_S) == 0.0
-        assert heat_before(folder.loaded(*HOT, holds=("tcp:other",)), ENDED_S) == 0.0
 
     @pytest.mark.parametrize("end", [{}, SAFE_END, {**SAFE_END, HEAT_FACT: "warm"}])
     def test_a_killed_run_s_is_worked_out_from_its_samples(self, folder, end):

@@ -132,10 +132,6 @@ def test_known_devices(devices_package):
     assert known["simulated_piezo"] == registry.BUILTIN["simulated_piezo"]
 
 
-def test_entry_point(devices_package):
-    assert registry.device_class("my_amplifier") is Amplifier
-
-
 @pytest.mark.parametrize(("kind", "hint"), [
     ("simulated_terfanol", "did you mean 'simulated_terfenol'?"),
     ("my_amplifyer", "did you mean 'my_amplifier'?"),

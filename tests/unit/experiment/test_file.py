@@ -14,8 +14,6 @@ from hilctl.base.yaml import Document
 from hilctl.experiment import devices as registry
 from hilctl.experiment import file as sections
 from hilctl.experiment.load import load_experiment, resolve
-from hilctl.models.plays import RdpiModel
-from hilctl.waveforms.spec import Sine
 
 FULL = """\
 name: full_example
@@ -120,44 +118,6 @@ def changed(old, new, text=FULL):
 
 
 class TestAccepted:
-    def test_full_example(self, folder):
-        loaded = load(FULL, folder)
-        config = loaded.config
-        assert (config.name, config.sample_rate_hz, config.block) == ("full_example", 50e3, 50)
-        assert config.waveform == Sine(
-            kind="sine",
-            unit="um",
-            amplitude=2.5,
-            offset=-1.0,
-            frequency_hz=10.0,
-            phase_deg=90.0,
-            duration_s=2.0,
-            soft_start_s=0.1,
-            soft_end_s=0.2,
-        )
-        assert config.compensator is not None
-        assert config.compensator.model == "model.yaml"
-        assert (config.limits.unit, config.limits.command_range) == ("A", (-7.07, 7.07))
-        assert (config.limits.slew_per_s, config.limits.stroke_um) == (20e3, (-75.0, 60.0))
-        assert (config.safe.value, config.safe.ramp_s) == (0.5, 0.2)
-        assert config.timing.late_policy == "catch_up"
-        assert (config.timing.late_after, config.timing.max_late_s) == (0.25, 2.0)
-        assert (config.timing.max_consecutive_late, config.timing.grace_s) == (7, 0.5)
-        assert config.recording.model_dump() == {
-            "folder": "runs",
-            "flush_s": 0.5,
-            "sync": True,
-            "scope_rate_hz": 500.0,
-            "ring_s": 20.0,
-            "on_failure": "go_on",
-        }
-        assert config.tick_s == pytest.approx(1e-3)
-        assert loaded.device.info.details["seed"] == "3"
-        assert loaded.device.info.details["load_kg"] == "3.7"
-        assert isinstance(loaded.model, RdpiModel)
-        assert loaded.model.thresholds == (0.3, 0.6, 0.9)
-        assert loaded.folder == folder
-
     def test_minimal_example(self):
         loaded = load(MINIMAL)
         assert (loaded.model, loaded.config.compensator) == (None, None)
@@ -195,44 +155,27 @@ class TestAccepted:
 ONE_RULE = [
     # key whose line is named, text to replace, replacement, key of the problem
     ("name", "name: full_example", "name: a b", "name"),
-    ("name", "name: full_example", "name: 12", "name"),
     ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: 50_000", "sample_rate_hz"),
-    ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: 0", "sample_rate_hz"),
     ("sample_rate_hz", "sample_rate_hz: 50000", "sample_rate_hz: 2.0e+6", "sample_rate_hz"),
-    ("block", "block: 50", "block: 0", "block"),
     ("block", "block: 50", "block: 4097", "block"),
     ("unit", "unit: um", "unit: mm", "waveform.unit"),
     ("unit", "unit: um", "unit: A", "waveform.unit"),
-    ("amplitude", "amplitude: 2.5", "amplitude: 0", "waveform.amplitude"),
     ("duration_s", "duration_s: 2.0", "duration_s: -2.0", "waveform.duration_s"),
-    ("soft_start_s", "soft_start_s: 0.1", "soft_start_s: -0.1", "waveform.soft_start_s"),
     ("phase_deg", "phase_deg: 90", "phase: 90", "waveform.phase"),
     ("model", "model: model.yaml", "model: 3", "compensator.model"),
     ("compensator", "compensator:\n  model: model.yaml", "compensator: {}", "compensator.model"),
-    ("compensator", "compensator:\n  model: model.yaml", "compensator: inverse", "compensator"),
     ("compensator", "compensator:\n  model: model.yaml", "compensator:", "compensator"),
     ("limits", "  slew_a_per_s: 20000.0\n", "", "limits"),
     ("limits", "  peak_current_a: 7.07\n", "  drive_v: [-1, 1]\n", "limits"),
-    ("peak_current_a", "peak_current_a: 7.07", "peak_current_a: -7.07", "limits.peak_current_a"),
     ("slew_a_per_s", "slew_a_per_s: 20000.0", "slew_a_per_s: 0", "limits.slew_a_per_s"),
     ("stroke_um", "[-75.0, 60.0]", "[60.0, -75.0]", "limits.stroke_um"),
-    ("stroke_um", "[-75.0, 60.0]", "[-75.0]", "limits.stroke_um"),
-    ("stroke_um", "[-75.0, 60.0]", "60.0", "limits.stroke_um"),
     ("stroke_um", "[-75.0, 60.0]", "[low, 60.0]", "limits.stroke_um.0"),
     ("value", "value: 0.5", "value: 7.1", "safe.value"),
-    ("ramp_s", "ramp_s: 0.2", "ramp_s: 0.0", "safe.ramp_s"),
     ("late_policy", "late_policy: catch_up", "late_policy: hurry", "timing.late_policy"),
-    ("late_after", "late_after: 0.25", "late_after: 0", "timing.late_after"),
-    ("max_late_s", "max_late_s: 2.0", "max_late_s: -1", "timing.max_late_s"),
-    ("flush_s", "flush_s: 0.5", "flush_s: 10.5", "recording.flush_s"),
     ("scope_rate_hz", "scope_rate_hz: 500.0", "scope_rate_hz: 1001", "recording.scope_rate_hz"),
-    ("ring_s", "ring_s: 20.0", "ring_s: 0.5", "recording.ring_s"),
-    ("ring_s", "ring_s: 20.0", "ring_s: 61", "recording.ring_s"),
     ("ring_s", "ring_s: 20.0", "ring_s: 1.0", "recording"),
-    ("seed", "seed: 3", "seed: -3", "device.seed"),
     ("seed", "seed: 3", "sed: 3", "device.sed"),
     ("load_kg", "load_kg: 3.7", "load_kg: 101", "device.load_kg"),
-    ("at_sample", "at_sample: 9000", "at_sample: soon", "device.fault.at_sample"),
     ("fault", "    at_sample: 9000\n", "", "device.fault.at_sample"),
 ]
 
@@ -314,20 +257,6 @@ class TestSet:
         assert config.timing.late_policy == "slip"
         assert config.timing.late_after == 0.5
 
-    def test_a_section_the_file_has_not(self):
-        loaded = load(MINIMAL, settings=("recording.folder=elsewhere", "device.seed=9"))
-        assert loaded.config.recording.folder == "elsewhere"
-        assert loaded.device.info.details["seed"] == "9"
-
-    def test_item_of_a_list_of_mappings(self, folder):
-        sequence = (
-            "waveform={kind: sequence, unit: um, parts: ["
-            "{kind: hold, level: 1.0, duration_s: 1.0}, {kind: hold, level: 2.0, duration_s: 1.0}]}"
-        )
-        config = load(FULL, folder, (sequence, "waveform.parts.1.level=3.0")).config
-        parts = config.waveform.model_dump()["parts"]
-        assert [part["level"] for part in parts] == [1.0, 3.0]
-
     @pytest.mark.parametrize(("setting", "key"), [
         ("block=2.5", "block"),
         ("limits.stroke_um.0=x", "limits.stroke_um.0"),
@@ -401,25 +330,6 @@ def test_other_names_are_refused(text):
         NAME.validate_python(text)
 
 
-@pytest.mark.parametrize("given", [(1.0,), (1.0, 2.0, 3.0), (2.0, 1.0), (1.0, 1.0)])
-def test_an_interval_is_two_rising_numbers(given):
-    assert INTERVAL.validate_python((1.0, 2.0)) == (1.0, 2.0)
-    with pytest.raises(ValidationError, match=r"must be \[lowest, highest\]"):
-        INTERVAL.validate_python(given)
-
-
-def test_the_ring_bridges_three_flushes():
-    assert sections.RecordingConfig(flush_s=2.0, ring_s=6.0).ring_s == 6.0
-    with pytest.raises(ValidationError, match="flush_s"):
-        sections.RecordingConfig(flush_s=2.0, ring_s=5.9)
-
-
-@pytest.mark.parametrize("way", [{"bandwidth_hz": 5.0}, {"ki_per_s": 3.0},
-                                 {"ki_per_s": 3.0, "kp": 0.0}])  # fmt: skip
-def test_one_way_of_feedback_is_enough(way):
-    assert sections.PiFeedbackConfig(limit_um=1.0, **way).limit_um == 1.0
-
-
 @pytest.mark.parametrize("ways", [{}, {"kp": 0.1}, {"bandwidth_hz": 5.0, "ki_per_s": 3.0},
                                   {"bandwidth_hz": 5.0, "kp": 0.1}])  # fmt: skip
 def test_no_way_of_feedback_and_both_are_refused(ways):
@@ -430,12 +340,6 @@ def test_no_way_of_feedback_and_both_are_refused(ways):
 STROKE = {"stroke_um": (-50.0, 50.0)}
 CURRENT = {"peak_current_a": 7.0, "slew_a_per_s": 1e4}
 IN_VOLTS = {"drive_v": (-20.0, 120.0), "slew_v_per_s": 2e4}
-
-
-def test_a_peak_current_counts_both_ways_and_a_drive_as_it_is():
-    current, voltage = sections.Limits(**STROKE, **CURRENT), sections.Limits(**STROKE, **IN_VOLTS)
-    assert (current.unit, current.command_range, current.slew_per_s) == ("A", (-7.0, 7.0), 1e4)
-    assert (voltage.unit, voltage.command_range, voltage.slew_per_s) == ("V", (-20.0, 120.0), 2e4)
 
 
 @pytest.mark.parametrize("given", [{}, {"peak_current_a": 7.0}, {"slew_v_per_s": 2e4},
@@ -449,13 +353,6 @@ def test_incomplete_and_mixed_limits_are_refused(given):
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 LABELS = TypeAdapter(sections.Labels, config=ConfigDict(strict=True))
-
-
-def test_texts_and_numbers_stay_what_they_are():
-    given = {"sample": "A7", "temperature_c": 21.5, "count": 3, "note": "x" * sections.LONGEST_TEXT}
-    kept = LABELS.validate_python(given)
-    assert kept == given
-    assert isinstance(kept["count"], int)
 
 
 @pytest.mark.parametrize("labels", [

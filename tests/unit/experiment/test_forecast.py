@@ -49,12 +49,6 @@ class TestForecast:
             result.reference.values.max(),
         )
 
-    def test_safe_value_counts(self):
-        settings = ("waveform.amplitude=1.0", "safe.value=-2.0", "limits.slew_a_per_s=25000.0")
-        forecast = checked(CURRENT, *settings).forecast
-        assert forecast.command_min == -2.0
-        assert forecast.command_max == pytest.approx(1.5, abs=1e-4)
-
     @pytest.mark.parametrize("chunk", [1, 7, 1000, 9999, 10_000, 10_001])
     def test_chunks_change_nothing(self, monkeypatch, chunk):
         model = terfenol_rdpi()
@@ -157,11 +151,6 @@ def test_what_drifts_is_worked_out(drift):
     counted = gone_through(500.0, 5_000_000, lambda t: np.sin(np.pi * t / 250.0) + drift * t)
     assert counted.samples + counted.passed == 5_000_000
     assert counted.passed * drift < 1.01e-3 * 2.0
-
-
-def test_what_is_not_finite_is_worked_out():
-    counted = gone_through(500.0, 1_000_000, lambda t: np.where(t > 10, np.nan, t))
-    assert (counted.samples, counted.passed) == (1_000_000, 0)
 
 
 REFERENCE = 10.0 + 5.0 * np.sin(np.arange(1000) / 50.0)

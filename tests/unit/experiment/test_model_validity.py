@@ -76,11 +76,6 @@ def test_what_hardly_moves_has_no_frequency():
     assert spectrum(np.zeros(1000), RATE_HZ, 10.0).highest_hz == 0.0
 
 
-def test_a_reference_shorter_than_a_window_is_one():
-    found = spectrum(sine(100.0, 1.0, 0.03), RATE_HZ, 10.0)
-    assert found.main_hz == pytest.approx(100.0, abs=40.0)
-
-
 @pytest.mark.parametrize("frequency_hz", [0.3, 1.0, 7.77, 37.0, 800.0])
 def test_the_highest_frequency_of_a_sine_is_its_own(frequency_hz):
     found = spectrum(sine(frequency_hz, seconds=30.0), RATE_HZ, frequency_hz)
