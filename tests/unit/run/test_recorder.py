@@ -400,14 +400,6 @@ def test_what_the_disk_refuses_stays_in_the_ring(ring, recording, monkeypatch):
     assert recording.stalled_s() == 0.0
 
 
-def test_events_of_both_sides_come_after_the_samples(ring, recording):
-    exchange(ring, 1)
-    ring.page.push_event(Event(0, "info", "of_the_loop", ""))
-    recording.record_event(Event(0, "warning", "of_the_supervisor", ""))
-    recording._work()
-    assert recording.recorder.events == ["of_the_loop", "of_the_supervisor"]
-
-
 def test_an_event_of_the_loop_never_comes_before_its_samples(ring, recording, monkeypatch):
     batches, recorder, went_on = ring.batches, recording.recorder, []
 
@@ -433,13 +425,6 @@ def test_what_a_dead_loop_had_sent_is_recorded_as_not_answered(ring, recording):
     recording._finish()
     assert recording.recorder.firsts == [0, 2, 3, 4, 5]
     assert recording.recorder.finished == ("it died", 6)
-
-
-def test_a_loop_that_ended_by_itself_says_where(ring, recording):
-    exchange(ring, 2)
-    recording.end(ENDED, lost_loop=False)
-    recording._finish()
-    assert recording.recorder.finished == ("waveform completed", 8)
 
 
 def test_whatever_goes_wrong_in_it_is_said_and_the_end_comes_all_the_same(ring, recording):
