@@ -188,27 +188,6 @@ class TestLoop:
         )  # fmt: skip
         return rig.run(), adapting, rig.host
 
-    @pytest.mark.slow
-    @pytest.mark.parametrize(("latency", "block"), [(0, 1), (0, 50), (3, 10)])
-    def test_offset_and_gain_are_found_through_a_fifo(self, latency, block):
-        """Of a device that shows 4 % more, and 2 um beside it."""
-
-        class Wrong(FakeFifoDevice):
-            def exchange(self, first_sample, command, displacement_um, measured):
-                super().exchange(first_sample, command, displacement_um, measured)
-                displacement_um *= 1.04
-                displacement_um += 2.0
-
-        outcome, adapting, host = self.ran(latency, block, Wrong(latency))
-        assert outcome.code == "completed"
-        found = adapting.parameters
-        assert found["gain"] == pytest.approx(1.04, abs=0.004)
-        displacement, reference = host.column(3)[6000:8000], host.column(0)[5999:7999]
-        assert np.abs(displacement - reference).max() < 0.15
-        last = host.events[-1]
-        assert (last.code, last.sample) == (ADAPTED, outcome.ended_at - 1)
-        assert dict(last.values) == found
-
     def test_a_lost_device_ends_with_the_parameters(self):
         outcome, adapting, host = self.ran(0, 10, FakeFifoDevice(0, break_at=3000))
         assert outcome.code == "fault"

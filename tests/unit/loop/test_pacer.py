@@ -103,15 +103,6 @@ def test_a_postponed_tick_is_due_in_a_period(now_ns, due_ns):
     assert (paced.wait(), paced.deadline_ns) == (0, due_ns + PERIOD_NS)
 
 
-@pytest.mark.parametrize("late_ns", [1_000_000, 3_200_000, 250_000_000])
-def test_deadline_after_a_skip_is_that_of_the_tick_that_runs(late_ns):
-    paced = pacer(FakeClock(5_000, {2: late_ns}))
-    for _ in range(3):
-        paced.wait()
-    assert paced.deadline_ns == 10_000 + paced.tick * PERIOD_NS
-    assert paced.late_ns == late_ns
-
-
 class TestMisses:
     def stalled(self, stalls_ns, ticks=400, grace_ticks=0):
         """Run ticks, with stalls by the number of the sleep; return the first reason, its tick."""
