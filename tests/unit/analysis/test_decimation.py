@@ -120,11 +120,3 @@ def test_many_ticks_are_told_by_some_of_them(small, monkeypatch, recording):
     assert ticks.late_ns.max() == 9_000_000
     assert np.all(np.diff(ticks.first_sample) > 0)
     assert np.median(ticks.late_ns) == pytest.approx(np.median(recording.ticks.late_ns), rel=0.02)
-
-
-def test_a_run_longer_than_planned_is_thinned_further(small, monkeypatch, recording):
-    monkeypatch.setattr(module, "_STRETCHES", 10**6)
-    monkeypatch.setattr(module, "_LAST_SAMPLES", 100)
-    found = overview(Parts(recording))[1]
-    assert found.samples.index.size < 30_000
-    assert 31_234 in found.samples.index

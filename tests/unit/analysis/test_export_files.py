@@ -13,7 +13,7 @@ import pytest
 from pyarrow import parquet
 
 from hilctl.analysis import export_files
-from hilctl.analysis.export_files import CsvFile, MatFile, NpzFile, ParquetFile
+from hilctl.analysis.export_files import CsvFile, MatFile, ParquetFile
 from hilctl.base.errors import InputError
 
 FACTS = {"run": json.dumps({"name": "x"}), "model_yaml": "", "experiment_yaml": "name: \u03bc\n"}
@@ -58,14 +58,6 @@ def test_mat_says_what_it_can_not_hold(tmp_path, monkeypatch):
         file.add(columns(0, 1000))
         with pytest.raises(InputError, match=r"1000 samples"):
             file.add(columns(1000, 1001))
-
-
-def test_npz_holds_each_array_as_a_whole(tmp_path):
-    with np.load(written(NpzFile, tmp_path / "x.npz", PARTS), allow_pickle=False) as found:
-        for name, values in WHOLE.items():
-            assert (found[name].dtype, found[name].tobytes()) == (values.dtype, values.tobytes())
-        assert {name: str(found[name]) for name in FACTS} == FACTS
-        assert found.files == [*WHOLE, *FACTS]
 
 
 @pytest.mark.parametrize("rows", [1000, 30_000, 10**9])
@@ -126,18 +118,3 @@ def test_only_columns_that_can_have_nulls_say_so(tmp_path):
     nullable = {field.name for field in file.schema_arrow if field.nullable}
     assert nullable == {"b", "c", "d"}
     assert file.read()["d"].to_pylist() == given["c"]
-
-
-def test_measured_numbers_lie_side_by_side(tmp_path):
-    """Where bytes are like those next to them, a file is small; few values are looked up."""
-    file = parquet.ParquetFile(written(ParquetFile, tmp_path / "x.parquet", PARTS))
-    group = file.metadata.row_group(0)
-    encodings = {
-        group.column(k).path_in_schema: set(group.column(k).encodings)
-        for k in range(group.num_columns)
-    }
-    assert "DELTA_BINARY_PACKED" in encodings["sample"]
-    assert all("BYTE_STREAM_SPLIT" in encodings[name] for name in ("t_s", "reference_um", "a"))
-    assert "RLE_DICTIONARY" in encodings["flags"]
-    schema = file.schema_arrow
-    assert schema.metadata[b"hilctl.experiment_yaml"].decode() == FACTS["experiment_yaml"]

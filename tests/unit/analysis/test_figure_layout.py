@@ -67,11 +67,6 @@ def test_no_legend_is_wider_than_its_figure():
     assert box.x1 <= whole.x1
 
 
-def test_long_titles_are_broken():
-    sheet = FigureSpec("a", "", panels(4, title="with compensator, 250 Hz"), alike=True)
-    assert "\n" in drawn(sheet).axes[0].get_title("left")
-
-
 @pytest.fixture
 def figure():
     return drawn(FigureSpec("a", "", (Panel(lambda axes: axes.plot([0, 1], [0, 1]), "x"),)))

@@ -8,7 +8,6 @@ from matplotlib.collections import FillBetweenPolyCollection
 
 from hilctl.analysis import plot_style, plots
 from hilctl.analysis.figure_layout import drawn
-from hilctl.analysis.html import svg
 from hilctl.analysis.plots import before_and_after, error_spectrum, hysteresis_loop
 from hilctl.base.segments import Segment
 from hilctl.recording.recording import Recording, Ticks
@@ -41,15 +40,6 @@ def lines(axes) -> dict[str, object]:
 
 
 class TestTimeHistory:
-    def test_few_cycles_are_lines_with_units(self, run) -> None:
-        recording = run()
-        upper, lower = drawn(plots.time_history(recording)).axes
-        assert {"displacement", "reference"} <= set(lines(upper))
-        assert upper.get_ylabel() == "displacement, µm"
-        assert lower.get_ylabel() == "command, A"
-        assert lower.get_xlabel() == "time, s"
-        assert lower.get_xlim()[1] >= 4300 / 50_000
-
     def test_many_cycles_are_a_band(self, run) -> None:
         upper = drawn(plots.time_history(run(cycles=400))).axes[0]
         bands = [c for c in upper.collections if isinstance(c, FillBetweenPolyCollection)]
@@ -107,23 +97,6 @@ class TestHysteresisLoop:
             height = np.ptp(lines(axes)[label].get_ydata())
             assert height == pytest.approx(80.0 * np.sin(0.1), rel=1e-3)
 
-    def test_compensated_run_is_held_against_its_reference(self, run) -> None:
-        right = drawn(plots.hysteresis_loop(run())).axes[1]
-        x, y = right.get_lines()[0].get_data()
-        assert (x[0], y[0]) == (x[-1], y[-1])
-        assert np.abs(y).max() == pytest.approx(80.0 * np.sin(0.05), rel=1e-3)
-
-    def test_each_segment_has_its_loop(self, run) -> None:
-        recording = run(cycles=9)
-        ends = [(3000 * k, 3000 * k + 3000) for k in range(4)]
-        parts = [Segment(f"part {k}", *ends[k], *ends[k], PERIOD) for k in range(4)]
-        figure = drawn(plots.hysteresis_loop(replace(recording, segments=tuple(parts))))
-        axes = figure.axes[0]
-        shown = {text.get_text() for text in figure.legends[0].get_texts()}
-        assert {"part 0", "part 1", "part 2"} <= shown
-        assert "part 3" not in shown
-        assert len({str(line.get_color()) for line in axes.get_lines()[:3]}) == 3
-
     def test_what_does_not_repeat_is_drawn_as_measured(self, run) -> None:
         recording = run()
         once = replace(recording.segments[0], period=0.0)
@@ -161,21 +134,6 @@ class TestLateness:
         assert (bars[0].get_x(), bars[0].get_height()) == (pytest.approx(1.0), 2)
         assert (axes.get_xscale(), axes.get_yscale()) == ("log", "log")
         assert {text.get_text() for text in axes.texts} >= {"p50 40.0 µs", "max 3.00 ms"}
-
-    def test_ticks_that_are_all_alike_can_be_drawn(self, run) -> None:
-        same = np.full(5, 30_000, dtype=np.int64)
-        ticks = Ticks(same, same, same, same)
-        assert drawn(plots.lateness(replace(run(), ticks=ticks))).axes
-
-
-@pytest.mark.slow
-def test_every_figure_can_be_drawn(run) -> None:
-    recording = run()
-    for sheet_of in (
-        plots.time_history, plots.steady_cycles, plots.hysteresis_loop, plots.error,
-        plots.spectrum, plots.lateness,
-    ):  # fmt: skip
-        assert svg(drawn(sheet_of(recording)), "").startswith("<svg ")
 
 
 class TestSpectrum:

@@ -2,14 +2,14 @@
 
 import json
 from collections.abc import Iterator
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
-from hilctl.analysis.report import SegmentReportBuilder, processes_of, summarize, worst_segment
+from hilctl.analysis.report import processes_of, summarize, worst_segment
 from hilctl.analysis.run_metrics import RunReport, run_rows
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, LOST_READINGS, MARK, TUNED, ZERO, Event
@@ -226,14 +226,6 @@ class TestCutShort:
         assert missed.peak_hysteresis_percent is None
         assert (missed.samples, missed.steady_samples) == (0, 0)
 
-    def test_no_whole_cycle_has_no_figures(self, lagging) -> None:
-        recording = lagging()
-        report = summarize(replace(recording, samples=recording.samples.part(0, 900)))
-        assert report.steady_cycles == 0
-        assert report.peak_hysteresis_percent is None
-        assert report.peak_error_raw_percent is None
-        assert report.samples == 900
-
     def test_nothing_recorded_is_reported_as_that(self, lagging) -> None:
         recording = lagging(ticks=Ticks(*(np.empty(0, dtype=np.int64),) * 4))
         report = summarize(replace(recording, samples=recording.samples.part(0, 0), end={}))
@@ -427,10 +419,6 @@ def test_what_a_run_wrote_is_read(loop):
     }
 
 
-def test_of_an_old_recording_nothing_is_known():
-    assert processes_of(with_end({})) == {}
-
-
 @pytest.mark.parametrize("text", [
     "none",
     "[]",
@@ -447,51 +435,3 @@ def test_a_number_with_a_point_that_is_whole_is_one():
     """Other programs may write it so."""
     text = usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "98000000.0")
     assert processes_of(with_end({USAGE_FACT: text}))["loop"] == LOOP
-
-
-N = 20_000
-
-
-@pytest.fixture
-def noisy(make_recording):
-    """A compensated sine with noise, a gap, and readings that are doubtful or NaN."""
-    index = np.arange(N)
-    index[N // 2 :] += 137
-    rng = np.random.default_rng(4)
-    reference = 40.0 * np.sin(2.0 * np.pi * index / 500)
-    displacement = reference + 0.3 * np.cos(2.0 * np.pi * index / 500) + rng.normal(0, 0.01, N)
-    displacement[7_000:7_003] = np.nan
-    flags = np.zeros(N, dtype=np.uint32)
-    flags[12_000:12_040] = Flag.SENSOR_INVALID
-    return make_recording(displacement, reference_um=reference, index=index, flags=flags)
-
-
-def figures(recording, segment, window, bounds):
-    gathering = SegmentReportBuilder(recording, segment, window)
-    for part in np.split(np.arange(N), bounds):
-        if part.size:
-            gathering.add(recording.samples.rows(slice(part[0], part[-1] + 1)))
-    found = asdict(gathering.report())
-    assert found.pop("label") == "sine"
-    return {name: value for name, value in found.items() if value is not None}
-
-
-@pytest.mark.parametrize("compensated", [True, False])
-@pytest.mark.parametrize("period", [500.0, 1000.0 / 3.0, 0.0])
-@pytest.mark.parametrize("bounds", [[1], [9_997, 9_998, 10_001], range(0, N, 617), [0, 5, 5, 9]])
-def test_pieces_give_what_the_whole_gives(noisy, period, bounds, compensated):
-    part = Segment("sine", 0, N, 500, N - 500, period)
-    recording = replace(noisy, compensated=compensated)
-    window = (1000, N - 500, 37 if period else 0)
-    whole = figures(recording, part, window, [])
-    parts = figures(recording, part, window, bounds)
-    assert parts == pytest.approx(whole, rel=1e-9)
-    assert whole["sensor_noise_um"] == pytest.approx(0.01, rel=0.03)
-    assert parts["steady_samples"] == whole["steady_samples"] < N - 1500
-
-
-def test_a_segment_that_was_not_reached_has_none(noisy):
-    part = Segment("sine", 2 * N, 3 * N, 2 * N, 3 * N, 500.0)
-    found = figures(noisy, part, (2 * N, 3 * N, 40), [])
-    assert (found["samples"], found["steady_samples"]) == (0, 0)
-    assert found.keys() == {"start_s", "frequency_hz", "samples", "steady_cycles", "steady_samples"}

@@ -56,15 +56,6 @@ def test_uncompensated_runs_have_no_errors(report):
     assert not any("error" in name for name, _ in quality_rows(plain))
 
 
-def test_metrics_without_a_value_have_no_row(report):
-    unknown = replace(report, peak_hysteresis_percent=None, loop_area=None, steady_cycles=0)
-    assert dict(quality_rows(report)).keys() - dict(quality_rows(unknown)).keys() == {
-        "peak hysteresis",
-        "loop area",
-        "steady cycles",
-    }
-
-
 def test_columns_that_are_empty_everywhere_are_left_out(report):
     segment = report.segments[0]
     blank = replace(segment, frequency_hz=None)

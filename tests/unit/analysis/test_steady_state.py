@@ -59,11 +59,6 @@ def test_only_what_lies_behind_the_last_change_is_judged(run):
     assert summarize(recording).peak_to_peak_um == pytest.approx(10.0, rel=1e-3)
 
 
-def test_change_ends_the_one_before_it(run):
-    recording = run(tuned(200, 0.3, 100_000), tuned(300, 1.0, 50))
-    assert steady_part(recording, recording.segments[0]).samples.index[0] == 500
-
-
 def test_change_that_goes_on_to_the_end_leaves_nothing_to_judge(run):
     recording = run(tuned(300, 0.3, 10 * SAMPLES))
     part = steady_part(recording, recording.segments[0])
