@@ -7,7 +7,6 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import ConfigError
-from hilctl.cli import campaigns
 from hilctl.cli.campaigns import print_campaign, print_row, sweep_document
 from hilctl.experiment.correction import Correction, LearnedCycle
 from hilctl.ilc.ilc_session import IlcResult, IlcRow
@@ -104,11 +103,6 @@ def test_sweep_values(tmp_path):
         sweep_document(tmp_path / "rig.yaml", ["a"], 1)
     with pytest.raises(ConfigError, match="a="):
         sweep_document(tmp_path / "rig.yaml", ["a=1", "a=2"], 1)
-
-
-def test_notes_are_printed_to_standard_error(capsys):
-    campaigns._note("died")
-    assert capsys.readouterr().err == "hilctl: died\n"
 
 
 def test_row_prints_metrics_or_fault(capsys):

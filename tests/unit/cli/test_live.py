@@ -192,15 +192,6 @@ def test_empty_signal_has_no_curve(capsys):
     assert not any(0x2800 < ord(each) < 0x2900 for each in shown(View(feed), capsys))
 
 
-def test_a_missing_reference_does_not_change_the_scale(capsys):
-    feed = FakeFeed()
-    values = np.full((len(SIGNALS), 3), np.nan)
-    values[1] = 100.0, 110.0, 120.0
-    feed.show(np.arange(3.0), values)
-    text = shown(View(feed), capsys)
-    assert all(each in text for each in ("120┤", "100┤", "newest cycles, axis in s"))
-
-
 def test_control_characters_are_escaped(monkeypatch, capsys):
     monkeypatch.setattr(module.time, "sleep", lambda s: None)
     feed = FakeFeed(polls=3)

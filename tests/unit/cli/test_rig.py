@@ -9,8 +9,8 @@ import pytest
 from hilctl.base.calibration import CalibrationFile
 from hilctl.base.errors import RunError
 from hilctl.base.yaml import load_document
-from hilctl.cli.rig import plan_mapping, print_characterisation, print_plan, print_step
-from hilctl.run.start import StepStoppedError, paced, unpaced
+from hilctl.cli.rig import print_characterisation, print_plan, print_step
+from hilctl.run.start import StepStoppedError, unpaced
 from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.studies.characterise.results import Characterisation, StepRow
 from tests.unit.studies.characterise.conftest import experiment, limits, limits_with
@@ -70,13 +70,6 @@ def test_plan_and_result_are_printed(ends, command, tmp_path):
     assert ends["folder"] == tmp_path / "model-runs"
     assert ends["run"] is unpaced
     assert "discarded" not in ends
-
-
-def test_one_json_object_is_printed(ends, command, tmp_path):
-    printed = json.loads(command("--json", "--highest-hz", 20)[1])
-    assert printed["page"] == str(tmp_path / "model.html")
-    assert printed["output"] == str(tmp_path / "model.yaml")
-    assert (ends["run"], ends["highest_hz"]) == (paced, 20.0)
 
 
 @pytest.mark.parametrize("as_json", [False, True])
@@ -143,12 +136,6 @@ def test_plan_prints_cooling_with_a_thermal_limit(limits_with, capsys):
     for kept_to, text in ((limits_with(), "no thermal limit"), (budget, "7 s for the coil")):
         print_plan(CharacterisationPlan(kept_to, FOUND.steps, 7.0, 5000.0), Path("runs"))
         assert text in capsys.readouterr().out
-
-
-def test_plan_mapping(limits):
-    mapping = plan_mapping(CharacterisationPlan(limits, FOUND.steps, 7.0, 5000.0))
-    assert mapping["band_hz"] == [0.5, 80.0]
-    assert mapping["steps"] == [{"name": "rest", "purpose": "noise", "seconds": 2.0}]
 
 
 def test_earlier_and_new_steps_differ(capsys):
