@@ -72,11 +72,6 @@ def changed(before, after):
     return TEXT.replace(before, after)
 
 
-def test_values_are_plain():
-    data = document("a: 1\nb: [1.5, x, true, null]\nc: {d: 0x10, e: 1.0e+3}\nf:\n").data
-    assert data == {"a": 1, "b": (1.5, "x", True, None), "c": {"d": 16, "e": 1000.0}, "f": None}
-
-
 def test_a_good_document_becomes_a_model():
     bench = document().validate(SetUp)
     assert bench.limits == Limits(peak_a=6.0, steps=(1, 2, 3))
@@ -285,14 +280,6 @@ def test_a_section_that_is_none_becomes_a_mapping():
     document.set("a.kind=integral")
     document.set("a.gain=2.0")
     assert document.data == {"a": {"kind": "integral", "gain": 2.0}, "b": 1.0}
-
-
-def test_settings_add_up():
-    one = document()
-    one.set("limits={peak_a: 1.0}")
-    one.set("limits.steps=[1]")
-    one.set("limits.steps.0=3")
-    assert one.validate(SetUp).limits == Limits(peak_a=1.0, steps=(3,))
 
 
 def test_problems_of_a_setting_point_to_it():

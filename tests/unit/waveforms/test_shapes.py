@@ -69,10 +69,6 @@ def test_closed_form(
 
 
 class TestStep:
-    def test_levels_without_a_rise(self, made: Made) -> None:
-        values = made(100.0, kind="step", levels=(1.0, -2.0, 0.5), dwell_s=0.3, offset=10.0).values
-        np.testing.assert_array_equal(values, np.repeat([11.0, 8.0, 10.5], 30))
-
     def test_rise_is_linear_from_the_level_before(self, made: Made) -> None:
         """A level is reached from the one before, the first from 0, in rise_s."""
         values = made(10.0, kind="step", levels=(4.0, 2.0), dwell_s=1.0, rise_s=0.4).values
@@ -84,10 +80,6 @@ class TestStep:
         keys = {"offset": 10.0, "rest": 9.0, "dwell_s": 1.0, "rise_s": 0.4}
         values = made(10.0, kind="step", levels=(3.0,), **keys).values
         np.testing.assert_allclose(values[:5], [9.0, 10.0, 11.0, 12.0, 13.0], atol=1e-12)
-
-    def test_rise_as_long_as_the_dwell(self, made: Made) -> None:
-        values = made(100.0, kind="step", levels=(1.0, 2.0, 3.0), dwell_s=0.5, rise_s=0.5).values
-        np.testing.assert_allclose(values, np.arange(150) / 50.0, rtol=0.0, atol=1e-12)
 
     def test_dwells_that_are_no_binary_fraction(self, made: Made) -> None:
         """Two thousand dwells of 0.1 s at 10 Hz are one sample each, none early or late."""
