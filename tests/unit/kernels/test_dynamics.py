@@ -164,12 +164,6 @@ def test_the_first_weight_is_of_the_oldest_value():
     np.testing.assert_allclose(out, np.convolve(before, weights[::-1], "valid"), rtol=1e-13)
 
 
-def test_a_structure_begins_at_rest_whatever_its_memory_held():
-    out = np.empty(50)
-    mode_block(np.full(50, 2.0), STRUCTURE, np.array([9.0, 9.0, np.nan]), out)
-    np.testing.assert_allclose(out, 2.0, rtol=1e-12)
-
-
 def run(kernel, values, memory=None, parameters=PARAMETERS):
     memory = rest_memory(3 if parameters is PARAMETERS else 2) if memory is None else memory
     out = np.empty_like(values)
@@ -260,8 +254,3 @@ def test_nothing_is_one_and_a_turn_turns():
     turned = exponential(np.array([[0.0, -1.0], [1.0, 0.0]]) * math.pi / 3.0)
     half, side = 0.5, math.sqrt(0.75)
     np.testing.assert_allclose(turned, [[half, -side], [side, half]], rtol=1e-14)
-
-
-def test_a_stiff_one_that_is_damped_dies_away():
-    stiff = 1e6 * np.array([[0.0, 1.0], [-1.0, -0.2]])
-    np.testing.assert_allclose(exponential(stiff), 0.0, atol=1e-12)

@@ -191,19 +191,6 @@ def test_beyond_the_span_its_end_is_what_comes_nearest(sign):
     assert run(field_inverse, far, **given) == pytest.approx(sign * 12.0 * (1.0 - 0.1 * 2.0))
 
 
-@pytest.mark.parametrize("x", [1e-6, 0.01, 0.0599, 0.0601, 1.0])
-def test_a_drag_follows_from_the_lower_end(x):
-    """Ds/du = u - s from 0 gives s = u - (1 - exp(-u)), by the series as by the exponential."""
-    assert drag_step(0.0, 0.0, 2.0, 0.0, x, 1.0) == pytest.approx(x + math.expm1(-x), abs=1e-16)
-
-
-def test_a_drag_goes_on_above_its_cell_and_waits_after_a_turn():
-    up = drag_step(0.0, 0.0, 2.0, -1.0, 4.0, 1.0)
-    assert up == pytest.approx(2.0 - (1.0 - math.exp(-2.0)) * math.exp(-2.0))
-    assert drag_step(up, 0.0, 2.0, 4.0, 1.9, 1.0) == up
-    assert drag_step(up, 0.0, 2.0, 4.0, 1.8, 1.0) < up
-
-
 @pytest.mark.parametrize("length", [0.3, 2.0])
 @pytest.mark.parametrize(("held", "last", "u"), [
     (0.2, 1.4, 2.1),
@@ -241,13 +228,6 @@ def test_cells_give_together_what_one_does_until_the_field_turns():
     wanted = [drag_step(1.0, -1.0, 4.0, 0.0, now, 0.7) - 1.0 for now in u[rows]]
     np.testing.assert_allclose(one[:, 0], wanted, atol=1e-12)
     assert wanted[-1] > 2.0
-
-
-def test_a_mirrored_path_gives_mirrored_columns():
-    u, rows = path(), np.arange(3, 500, 31)
-    there, back = columns(u, rows, -3.0, 1.5, 5), columns(-u, rows, -4.5, 1.5, 5)
-    np.testing.assert_allclose(back[:, ::-1], -there, atol=1e-12)
-    assert (np.ptp(there, axis=0) > 0.1).all()
 
 
 def test_a_line_through_points_goes_on_straight():

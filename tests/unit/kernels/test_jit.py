@@ -10,7 +10,6 @@ import pytest
 
 from hilctl import kernels
 from hilctl.kernels import hysteresis, jit
-from hilctl.kernels.interlock import heat_block
 from hilctl.kernels.limit import limit_block
 
 PLAYS = (1.3, np.array([0.2, 0.5, 0.9]), np.array([0.7, 0.1, 0.4]))
@@ -91,20 +90,6 @@ def test_float32_is_refused(name):
     kernel, parameters = STREAMING[name]
     with pytest.raises(TypeError, match="No matching definition"):
         kernel(SIGNAL.astype(np.float32), *parameters, hysteresis.rest_memory(3), SIGNAL.copy())
-
-
-def test_float32_is_refused_everywhere_else():
-    narrow, out = SIGNAL.astype(np.float32), np.empty(400)
-    flags = np.zeros(400, dtype=np.uint32)
-    grid, memory = np.empty((400, 3)), hysteresis.rest_memory(3)
-    for kernel, arguments in (
-        (hysteresis.deadband_block, (*DEADBANDS, out)),
-        (hysteresis.play_outputs, (WIDENING, PLAYS[1], memory, grid)),
-        (limit_block, (0.0, -1.0, 1.0, 0.1, 1, 2, 4, out, flags)),
-        (heat_block, (0.1, 0.0, out)),
-    ):
-        with pytest.raises(TypeError, match="No matching definition"):
-            kernel(narrow, *arguments)
 
 
 def test_a_strided_view_is_refused():

@@ -88,11 +88,6 @@ def test_of_takes_over_unit_ranges_and_provenance():
     assert model.operators == inner.operators + 5
 
 
-def test_feedback_finds_the_resonance_where_the_base_has_one():
-    assert RefinedModel.of(STAGED, residual(), 0.0).structure == STAGED.structure
-    assert RefinedModel.of(piezo_ppi(), residual(), 0.0).structure is None
-
-
 @pytest.mark.parametrize("name", BASES)
 @pytest.mark.parametrize("direction", ["forward", "inverse"])
 def test_a_state_that_is_restored_goes_on_with_the_same_bits(name, direction):
