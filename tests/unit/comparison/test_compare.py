@@ -65,15 +65,6 @@ def test_inverses_are_tried_at_the_frequencies_of_the_data():
     assert {round(trial.frequency_hz, 3) for trial in judged.rows[0].trials} <= recorded
 
 
-def test_progress_rises_to_the_end():
-    told = []
-    compared(progress=lambda *each: told.append(each), frequencies_hz=[100.0])
-    parts = [done for done, _ in told]
-    assert parts == sorted(parts)
-    assert parts[-1] == 1.0
-    assert any("straight: " in text for _, text in told)
-
-
 def test_unknown_models_are_refused_at_once():
     with pytest.raises(InputError, match="did you mean 'preisach'"):
         compared(Path("nowhere.mcap"), ["presach"])
@@ -137,7 +128,3 @@ def test_a_trial_that_was_limited_has_a_star_and_a_note():
     assert next(table_rows(limited))[-1] == "0.75*"
     assert notes(limited)[-1].startswith("*: the limiter")
     assert not any(text.startswith("*") for text in notes(table(row("d", trial(50.0, 1.0)))))
-
-
-def test_a_real_device_is_said_to_have_no_trials():
-    assert "not simulated" in notes(table(row("duhem"), device=""))[-1]

@@ -257,23 +257,3 @@ def test_cpu_in_the_experiment(given, cpu):
 def test_wrong_settings_are_refused(wrong):
     with pytest.raises(ValidationError):
         Realtime.model_validate(wrong)
-
-
-def test_command_line_requires_real_time(monkeypatch):
-    from typer.testing import CliRunner
-
-    from hilctl.cli.commands import app
-
-    asked = []
-
-    def refuse(experiment, settings, *others):
-        asked.append(settings)
-        raise InputError("far enough")
-
-    monkeypatch.setattr("hilctl.api.runs.start_run", refuse)
-    monkeypatch.setattr("hilctl.cli.run.finish_dead_runs", lambda: None)  # not this machine's own
-    runner = CliRunner()
-    for flags in ([], ["--require-rt"], ["--require-rt", "--set", "name=other"]):
-        runner.invoke(app, ["run", "experiment.yaml", *flags])
-    required = "realtime.require=true"
-    assert asked == [[], [required], ["name=other", required]]
