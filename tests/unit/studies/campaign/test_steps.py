@@ -53,14 +53,6 @@ def test_whole_sections_and_the_condition(campaign):
     assert (config.condition.cycles, config.recording.flush_s, config.block) == (4, 1.0, 10)
 
 
-def test_broken_rules_have_their_place(campaign):
-    text = CAMPAIGN.replace("[10.0, 20.0]", "10:20") + "  name: [x]\nset: {name: y}\n"
-    with pytest.raises(ConfigError) as found:
-        campaign(text, "waveform.amplitude=2")
-    for place in ("5: vary.waveform.frequency_hz", "4: vary.waveform.amplitude", "6: vary.name"):
-        assert f"few.yaml:{place}:" in str(found.value)
-
-
 def test_all_that_is_wrong_is_said_at_once_with_its_line():
     text = (
         CAMPAIGN + "order: sideways\nrepeat: 0\nreference_run: {evry: 3}\ncondition: {cycles: 1}\n"

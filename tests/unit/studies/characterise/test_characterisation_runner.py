@@ -193,11 +193,6 @@ def test_a_real_device_keeps_real_time(experiment, monkeypatch):
         runner_of(experiment, StudyHost(run=unpaced))
 
 
-def test_a_broken_experiment_is_refused_at_once(experiment):
-    with pytest.raises(InputError, match="sample_rate_hz"):
-        runner_of(experiment, None, "sample_rate_hz=5e5")
-
-
 @pytest.mark.slow
 def test_fast_runs_wait_for_no_coil(experiment):
     rig = Rig()

@@ -27,13 +27,6 @@ def test_fits_are_drawn_along_frequency_only(crossed):
     assert drawn(along_amplitude[3]).get_ylabel() == "asymmetry, %"
 
 
-def test_points_are_never_cut_by_the_edge(crossed):
-    sheet = next(iter(plots.trend_sheets(crossed)))
-    axes = drawn(sheet.panels[0])
-    assert axes.get_ylim()[0] == 0.0
-    assert axes.get_ylim()[1] > 60.0
-
-
 def test_what_compensators_leave_is_a_figure_of_its_own(compensated):
     sheets = {sheet.name: sheet for sheet in plots.trend_sheets(compensated)}
     assert list(sheets) == ["hysteresis_against_frequency", "compensation_against_frequency"]
