@@ -9,7 +9,6 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError
-from hilctl_drivers.transport.resource_names import held_port
 from hilctl_drivers.wired_dac import SerialDac, SerialOptions
 from tests.fakes import made_safe
 from tests.unit.drivers.conftest import TIMEOUT_S
@@ -387,13 +386,6 @@ TWO_LINES = {
     "reader": {"profile": "agilent_34970a", "serial_port": "/dev/y"},
     "amplifier": {"gain_a_per_v": 1.0}, "sensor": {"um_per_v": 12.5}, "watchdog": "none",
 }  # fmt: skip
-BOARD = {**TWO_LINES, "profile": "cobs_board", "output": "DAC", "input": "ADC", "reader": None}
-
-
-def test_a_board_reads_itself():
-    info = SerialDac(SerialOptions.model_validate(BOARD)).info
-    assert info.holds == held_port("/dev/x")
-    assert "reader_vendor" not in info.details
 
 
 def test_a_marked_reading_is_missing(rig, tmp_path):

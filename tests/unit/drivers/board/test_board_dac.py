@@ -49,14 +49,6 @@ def sine(n):
     return 3.0 * np.sin(2 * np.pi * 50.0 * np.arange(n) / RATE_HZ)
 
 
-def test_says_that_it_streams(board):
-    info = board().device.info
-    assert info.buffered
-    assert (info.fifo_depth, info.latency_blocks) == (8192, FIFO_BLOCKS)
-    assert info.details["fifo_depth"] == "8192 samples"
-    assert info.details["fifo_level"] == f"{FIFO_BLOCKS} blocks"
-
-
 def test_each_displacement_belongs_to_its_command(board):
     driven = board()
     driven.open()

@@ -108,17 +108,6 @@ class TestBoard:
         assert board.ask(state)[3] == 1
         assert len(board.writes()) == len(before) + 1  # the watchdog's own
 
-    def test_state_after_a_stream_is_where_it_stopped(self, emulate):
-        board = emulate("cobs_board_fifo")
-        board.ask(b"\x15\x01" + struct.pack("<fH", 10_000.0, 100))
-        values = np.full(100, 4.0, dtype="<f4").tobytes()
-        for k in range(2):
-            board.ask(b"\x11\x02" + struct.pack("<IH", 100 * k, 100) + values)
-        board.ask(b"\x15\x03" + struct.pack("<fH", 0.0, 0))
-        output, reading = struct.unpack("<ff", board.ask(b"\x16\x04", after_ms=500)[4:])
-        assert output == 4.0
-        assert 1.5 < reading < 3.0
-
     def test_a_board_of_version_1_knows_no_state(self, emulate, tmp_path):
         text = shipped_profiles()["cobs_board"].read_text()
         (tmp_path / "old.yaml").write_text(text.replace("hilctl-2", "hilctl-1"))

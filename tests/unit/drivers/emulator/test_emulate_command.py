@@ -10,11 +10,10 @@ from typer.testing import CliRunner
 
 from hilctl.base.errors import InputError
 from hilctl.cli.commands import app
-from hilctl_drivers.emulator.emulate_command import is_experiment, serve, wired_experiment
+from hilctl_drivers.emulator.emulate_command import serve, wired_experiment
 from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.emulator.server import EmulatorServer
-from hilctl_drivers.profile import FOLDER
 
 CONFIGS = Path(__file__).parents[4] / "configs"
 
@@ -106,20 +105,6 @@ def test_options_become_the_emulator(words, tmp_path, monkeypatch):
     ]
 
 
-def test_an_experiment_is_told_from_a_profile(tmp_path):
-    assert is_experiment(str(CONFIGS / "modbus_labjack_t7.yaml"))
-    assert not is_experiment(str(FOLDER / "labjack_t7.yaml"))
-    assert not is_experiment("labjack_t7")
-    assert not is_experiment(str(tmp_path / "absent.yaml"))
-
-
-def test_it_has_the_wiring_of_the_experiment():
-    wired = wired_experiment(CONFIGS / "modbus_labjack_t7.yaml")
-    amplifier, sensor = wired.options.wiring
-    assert (amplifier.gain_a_per_v, amplifier.offset_a, sensor.um_per_v) == (4.0, -10.0, 12.5)
-    assert (wired.options.port, wired.options.link) == (5020, "tcp")
-
-
 def test_it_has_the_amplifier_of_the_experiment(tmp_path):
     limit = "amplifier: {voltage_max_v: 36, resistance_ohm: 4, inductance_h: 0.003}\n"
     path = tmp_path / "rig.yaml"
@@ -166,13 +151,6 @@ def test_options_that_do_not_fit_are_refused(tmp_path, words, key):
     ended = CliRunner().invoke(app, ["emulate", str(path), *words])
     assert ended.exit_code != 0
     assert key in str(ended.exception)
-
-
-def test_a_reader_has_its_own_place():
-    options = wired_experiment(CONFIGS / "modbus_adam_6224.yaml").options
-    assert (options.reader, options.reader_line, options.reader_port) == ("adam_6217", "own", 5021)
-    options = wired_experiment(CONFIGS / "serial_scpi_kepco.yaml").options
-    assert (options.reader, options.reader_line) == ("agilent_34970a", "own")
 
 
 def test_a_port_that_no_user_may_listen_on_is_another_one(tmp_path):

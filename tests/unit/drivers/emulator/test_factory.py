@@ -43,12 +43,6 @@ def test_a_piezo_is_scaled_to_its_wiring(emulate, gain, offset_v, um_per_v, low_
     assert rig.displacement_um == pytest.approx(0.8 * 10.0 * abs(um_per_v), rel=0.01)
 
 
-def test_port_in_use_is_one_line(served):
-    address = served("labjack_t7")
-    with pytest.raises(InputError, match=f"can't listen on {address}"):
-        served("labjack_t7", port=int(address.split(":")[1]))
-
-
 @pytest.mark.parametrize(("profile", "options", "words"), [
     ("waveshare_ao_8ch", {}, "has no input to show a displacement at: name a reader"),
     ("waveshare_ai_8ch", {}, "has no output to drive .*: it can be another one's reader"),

@@ -65,17 +65,6 @@ def armed():
     return made
 
 
-def test_it_is_off_until_its_last_step_is_written():
-    registers = Registers()
-    registers.write(61604, 3, 0)
-    assert not registers.watchdog.armed
-    assert registers.watchdog.due_ns is None
-    registers.write(61600, 1, 10 * S)
-    assert registers.watchdog.armed
-    assert registers.watchdog.timeout_s == 3.0
-    assert registers.watchdog.due_ns == 13 * S
-
-
 def test_any_request_feeds_it_and_ends_a_trip(armed):
     armed.watchdog.request(12 * S)
     assert armed.watchdog.due_ns == 15 * S

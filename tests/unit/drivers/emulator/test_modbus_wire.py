@@ -6,9 +6,6 @@ from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.modbus.pdu import (
-    ReadFrame,
-    WriteFrame,
-    feedback_pdu,
     read_pdu,
     reply_data,
     rtu_adu,
@@ -42,24 +39,6 @@ def ask(wire, pdu, now_ns=0):
     """Send a request over TCP framing and return the checked reply's data."""
     (request,) = requests(wire, tcp_adu(7, 1, pdu))
     return reply_data(pdu, tcp_pdu(wire.answer(request, now_ns).data, 7, 1))
-
-
-def test_write_moves_and_read_shows(t7):
-    """Function 16 puts out, functions 3 and 4 read the same on a LabJack."""
-    ask(t7, write_pdu(1000, FLOAT32.encode(3.25)))
-    volts = [FLOAT32.decode(ask(t7, read_pdu(f, 0, 2), 10 * MS)) for f in (3, 4)]
-    assert volts[0] == volts[1]
-    assert 12.5 * volts[0] == pytest.approx(16.5, abs=1.0)
-    assert FLOAT32.decode(ask(t7, read_pdu(3, 1000, 2))) == 3.25
-
-
-def test_feedback_reads_before_the_command_acts(t7):
-    """Function 76 writes and reads in one; the reading is of the moment of the write."""
-    pdu = feedback_pdu(ReadFrame(0, 2), WriteFrame(1000, FLOAT32.encode(4.0)))
-    first = FLOAT32.decode(ask(t7, pdu))
-    second = FLOAT32.decode(ask(t7, pdu, 10 * MS))
-    assert abs(12.5 * first) < 0.5
-    assert 12.5 * second > 5.0
 
 
 def test_coupler_reads_elsewhere_than_it_writes():

@@ -123,12 +123,6 @@ class TestScpi:
         assert supply.ask(b"SYST:ERR?").startswith(b"-113")
         assert supply.ask(b"CURR?") == b"3.000000E+00"
 
-    def test_the_voltmeter_sees_what_the_supply_does(self, supply):
-        voltmeter = supply.emulator.reader
-        supply.ask(b"CURR 5")
-        answer = voltmeter.answer(b"READ?", START_NS + 500 * MS)
-        assert 2.0 < float(answer.data) < 3.5
-
 
 def test_gen_refuses_with_its_codes(emulate):
     supply = emulate("tdk_lambda_gen", reader="agilent_34970a")

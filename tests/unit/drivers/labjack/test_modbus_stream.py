@@ -109,13 +109,6 @@ def alone(commands, rate_hz=RATE_HZ):
     return found
 
 
-def test_says_that_it_streams(driven):
-    info = driven().device.info
-    assert (info.fifo_depth, info.max_rate_hz) == (8192, 50_000.0)
-    assert info.details["fifo_depth"] == "8192 samples"
-    assert info.details["fifo_level"] == f"{FIFO_BLOCKS} blocks"
-
-
 @pytest.mark.parametrize("channels", [0, 2])
 @pytest.mark.parametrize("profile", ["labjack_t7", "labjack_t4"])
 def test_each_displacement_belongs_to_its_command(driven, profile, channels):
@@ -152,32 +145,6 @@ def test_the_device_keeps_the_pace(driven):
     made.hold(1.0, 50)
     assert made.time() - before == pytest.approx(50 * BLOCK / RATE_HZ, rel=0.01)
     assert made.device.stream.level_min > (FIFO_BLOCKS - 1.1) * BLOCK
-    assert made.clock.underruns == 0
-
-
-def test_a_block_costs_no_more_messages_than_values_and_readings_need(driven):
-    """58 values or 120 readings fill a message; the readings that wait come with the values."""
-    made = driven(message_s=0.001)
-    made.open(20_000.0, 580)
-    for _ in range(FIFO_BLOCKS + 3):
-        made.exchange(np.zeros(580))
-    before = len(made.link.requests)
-    for _ in range(10):
-        made.exchange(np.zeros(580))
-    assert len(made.link.requests) - before <= 10 * (10 + 5)
-
-
-@pytest.mark.slow
-def test_the_highest_rate_needs_all_of_the_messages(driven):
-    """At 1 ms a message and nearly the rate that check allows, nothing runs dry."""
-    made = driven(message_s=0.001, fifo_blocks=6)
-    rate_hz = 50_000.0
-    made.open(rate_hz, 1160)
-    commands = sine(40 * 1160, rate_hz=rate_hz)
-    back = [made.exchange(part) for part in np.split(commands, 40)]
-    found = np.concatenate(back[6:])
-    expected = alone(commands[: found.size], rate_hz)
-    assert found == pytest.approx(expected, abs=0.51 * LSB_UM)
     assert made.clock.underruns == 0
 
 
@@ -488,24 +455,6 @@ def test_readings_are_waited_for_by_the_device_s_clock(scene):
     assert made.device.calls == 4
 
 
-def test_readings_beyond_those_asked_for_are_kept(scene):
-    made = scene((12, 0, 88), (12, 0, 76))
-    made.session.start()
-    assert made.session.take(10).tolist() == list(range(10))
-    assert made.session.take(2).tolist() == [10, 11]
-    assert made.device.calls == 1
-    assert made.session.take(7).tolist() == list(range(12, 19))
-    assert made.slept_s == [0.01, 0.007]
-
-
-def test_more_than_one_answer_holds_is_fetched_in_parts(scene):
-    most = stream.SAMPLES_MAX
-    made = scene((most, 0, 280), (30, 0, 250), queued=most + 280)
-    made.session.start()
-    assert made.session.take(most + 30).size == most + 30
-    assert made.slept_s == [most / STREAM_HZ, 0.03]
-
-
 def test_a_late_device_is_waited_for_and_a_standing_one_is_not(scene):
     late = scene(*[(0, 0, 100)] * 10, (10, 0, 90))
     late.session.start()
@@ -519,18 +468,6 @@ def test_a_late_device_is_waited_for_and_a_standing_one_is_not(scene):
     with pytest.raises(DeviceError, match=r"0 of 10 readings"):
         standing.session.take(10)
     assert sum(standing.slept_s) == pytest.approx(0.12)
-
-
-def test_a_stall_of_the_host_is_not_the_clock_of_the_device(scene):
-    made = scene((2, 8, 90), (8, 0, 90))
-    made.session.start()
-    call = made.device.call
-    made.device.call = lambda frames: (made.slept_s.append(10.0), call(frames))[1]
-    assert made.session.take(10).size == 10
-
-
-def test_the_margin_is_rounded_up(scene):
-    assert scene(turnaround_s=0.0011).session.margin == 4
 
 
 @pytest.mark.parametrize(
@@ -589,16 +526,6 @@ def test_readings_of_the_stream_before_are_forgotten(scene):
     made.session.feed(np.zeros(100))
     made.session.start()
     assert made.session.take(10).tolist() == list(range(50, 60))
-
-
-def test_readings_come_with_values_that_are_fed_while_it_runs(scene):
-    made = scene((60, 0, 40), (0, 0, 40 + 58))
-    made.session.start()
-    made.session.feed(np.zeros(stream.VALUES_MAX + 2))
-    assert made.device.calls == 2
-    assert made.session.level_min == 40
-    assert made.session.take(60).size == 60
-    assert made.device.calls == 2
 
 
 def test_a_rate_that_the_device_can_not_make_is_refused(scene):

@@ -11,7 +11,6 @@ from pydantic import ValidationError
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
-from hilctl_drivers.profile import shipped_profiles
 from tests.fakes import T7_OPTIONS, made_safe
 from tests.unit.drivers.modbus.conftest import exchange
 
@@ -98,12 +97,6 @@ class TestOptions:
         assert info.max_rate_hz == pytest.approx(174.0, abs=1.0)
         assert "FC23 at 115200 8N1" in info.rate_note
         assert made(**options, baud=9600).info.max_rate_hz == pytest.approx(29.0, abs=1.0)
-
-    def test_watchdog_is_said_before_it_is_opened(self):
-        wanted = {"timeout_s": 1.0, "safe_command": 1.5, "reason": "holds a load"}
-        info = made(watchdog=wanted).info
-        assert (info.watchdog_command, info.watchdog_reason) == (1.5, "holds a load")
-        assert made().info.watchdog_command is None
 
     def test_wiring_is_kept_as_json(self):
         calibration = {"date": "2026-01-01", "by": "N. N.", "reference": "sheet 4"}
@@ -479,11 +472,6 @@ class TestPlaces:
         assert info.max_rate_hz == pytest.approx(1.0 / total_s)
         assert "FC04 at 9600 8N1, then FC06 at 9600 8N1" in info.rate_note
 
-    def test_baud_of_a_shared_line_is_that_of_both(self):
-        assert placed(baud=115200).info.rate_note.startswith(
-            "FC04 at 115200 8N1, then FC06 at 115200"
-        )
-
     def test_slower_device_limits_a_faster_wire(self):
         pair = {"profile": "adam_4024", "reader": {"profile": "adam_4117", "unit_id": 2}}
         slow = placed(**pair, baud=115200).info
@@ -516,21 +504,6 @@ class TestPlaces:
         with pytest.raises(InputError, match="both are unit"):
             placed(**ours, reader={**theirs, "unit_id": 1})
 
-    def test_what_it_is_is_kept(self):
-        info = placed().info
-        assert info.description == (
-            "ICP DAS M-7024 (Modbus RTU) at /dev/x: AO0; ICP DAS M-7017 (Modbus RTU), unit 2 at "
-            "/dev/x: AI0"
-        )
-        assert info.details["model"] == "M-7024 (Modbus RTU)"
-        assert info.details["reader_model"] == "M-7017 (Modbus RTU)"
-        assert "m7000_address_mapping" in info.details["reader_source"]
-        shipped = shipped_profiles()
-        assert info.files == {
-            "profile.yaml": shipped["icp_m7024"].read_text(),
-            "reader_profile.yaml": shipped["icp_m7017"].read_text(),
-        }
-
 
 class TestAux:
     INPUTS = "".join(
@@ -555,10 +528,6 @@ class TestAux:
             made.exchange(0.0)
             found.append(device.aux.tolist())
         assert found == [[40.0, 101.0], [60.0, 101.0], [60.0, 141.0]]
-
-    def test_it_costs_one_request_a_sample(self):
-        bare, aux = made(), made(aux={"coil_c": {"input": "AIN2"}})
-        assert aux.info.max_rate_hz == pytest.approx(0.5 * bare.info.max_rate_hz)
 
     @pytest.mark.parametrize(("changes", "words"), [
         ({"aux": {"coil_c": {"input": "AIN99"}}}, r"aux.coil_c.input.*AIN2.*LabJack T7.*'AIN99'"),

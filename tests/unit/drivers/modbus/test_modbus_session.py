@@ -272,25 +272,6 @@ class TestRtu:
         assert gaps.highest_rate_hz == pytest.approx(TABLE_HZ["gaps"][column], rel=0.03)
         assert none.highest_rate_hz == pytest.approx(TABLE_HZ["none"][column], rel=0.03)
 
-    def test_two_transactions(self):
-        profile = load_profile("icp_m7024")
-        one = exchange_time(profile, "AO0", None)
-        two = exchange_time(rtu(), "AO", "AI", one_transaction=False)
-        assert (one.gaps, two.gaps) == (2, 4)
-        assert one.turnaround_s == profile.turnaround_s
-        assert str(two).startswith("FC03+FC16 at 115200 8N1: request ")
-
-    def test_text(self):
-        assert str(exchange_time(rtu(), "AO", "AI")) == (
-            "FC23 at 115200 8N1: request 1.48 ms, reply 0.78 ms, 2 gaps 3.50 ms,"
-            " turnaround 0.00 ms -> at most 174 Hz"
-        )
-
-    def test_stop_bits(self):
-        one, two = rtu(gap_s=0.0), rtu(gap_s=0.0, stopbits=2)
-        ratio = exchange_time(two, "AO", "AI").total_s / exchange_time(one, "AO", "AI").total_s
-        assert ratio == pytest.approx(11 / 10)
-
 
 @pytest.mark.parametrize(("output", "one", "rate_hz", "text"), [
     ("DAC0", True, 1000.0, "FC76 over TCP: turnaround 1.00 ms -> at most 1000 Hz"),
@@ -302,11 +283,6 @@ def test_time_over_tcp_is_the_device_s_own(output, one, rate_hz, text):
     time = exchange_time(load_profile("labjack_t7"), output, "AIN0", one_transaction=one)
     assert time.highest_rate_hz == pytest.approx(rate_hz)
     assert str(time).endswith(text)
-
-
-def test_a_device_without_turnaround_has_no_limit_over_tcp():
-    profile = load_profile("labjack_t7").model_copy(update={"turnaround_s": 0.0})
-    assert exchange_time(profile, "DAC0", "AIN0").highest_rate_hz == float("inf")
 
 
 def requests_s(*pdus):
@@ -329,10 +305,6 @@ READ, WRITE = read_pdu(3, 101, 1), write_single_pdu(101, bytes(2))
 ])  # fmt: skip
 def test_each_kind_of_step_counts_with_all_that_it_may_send(feed, seconds):
     assert feed_time(acme(feed)).total_s == pytest.approx(seconds)
-
-
-def test_over_tcp_the_turnaround_counts():
-    assert feed_time(acme(link="{kind: tcp}")).total_s == pytest.approx(0.002)
 
 
 @pytest.mark.parametrize("name", ["labjack_t7", "wago_750", "adam_6024"])

@@ -48,13 +48,6 @@ class TestBlocks:
         parts = [run(actuator, part) for part in np.split(self.COMMAND_A, sorted(cuts))]
         np.testing.assert_array_equal(np.concatenate(parts), whole)
 
-    def test_seed_decides_the_noise(self):
-        one, same, other = (
-            run(TerfenolActuator(RATED, RATE_HZ, seed=seed), self.COMMAND_A) for seed in (3, 3, 4)
-        )
-        np.testing.assert_array_equal(one, same)
-        assert not np.array_equal(one, other)
-
     def test_hold_is_a_constant_command(self):
         """Holding equals sending the same command that many times, over any length."""
         sent, held = TerfenolActuator(RATED, RATE_HZ), TerfenolActuator(RATED, RATE_HZ)

@@ -130,21 +130,6 @@ def test_open_refuses_block(closed, block):
         closed.open(RATE_HZ, block)
 
 
-def test_info_of_all():
-    """They are buffered, and the details hold parameters and options as text."""
-    info = SimulatedTerfenol(TerfenolOptions(load_kg=3.7, bias_a=0.2)).info
-    assert (info.buffered, info.fifo_depth, info.measures_command) == (True, 4096, True)
-    details = {"seed": "1", "load_kg": "3.7", "bias_a": "0.2", "stiffness_n_per_m": "33597000.0"}
-    assert details.items() <= info.details.items()
-
-
-def test_noise_can_be_turned_off():
-    """Without noise, a device at rest reads exactly 0."""
-    assert not send(terfenol(noise=False), 0, np.zeros(BLOCK)).any()
-    piezo = opened(SimulatedPiezo(PiezoOptions(noise=False)))
-    assert not send(piezo, 0, np.zeros(BLOCK)).any()
-
-
 @pytest.mark.parametrize("value", [5.01, -5.01, np.nan])
 def test_a_refused_block_is_not_noticed_by_the_plant(value):
     """The text names device, index, value and range."""
@@ -181,13 +166,6 @@ class TestSampleCount:
         send(device, 0, np.zeros(BLOCK))
         with pytest.raises(DeviceError, match=r">= 50.*got 49"):
             send(device, BLOCK - 1, np.zeros(BLOCK))
-
-    def test_measured_follows_the_command(self, closed):
-        """The measured command settles at the command, within one DAC code."""
-        measured = np.empty(BLOCK)
-        opened(closed).exchange(0, np.full(BLOCK, 2.0), np.empty(BLOCK), measured)
-        assert measured[0] == 0.0
-        assert measured[-1] == pytest.approx(2.0, abs=2e-3)
 
 
 class TestFaults:
