@@ -97,14 +97,6 @@ def test_commands_may_all_lie_on_one_side(fit):
     assert judge(found_by(fit, data), data).peak_percent <= most_percent
 
 
-def test_bouc_wen_parameters_are_found(data_of):
-    for truth in (BOUC_WEN, BOUC_WEN_2):
-        found = found_by(fit_bouc_wen, data_of(truth))
-        assert found.exponent == truth.exponent
-        for name in ("direct", "hysteretic", "beta", "gamma", "output_offset_um"):
-            assert getattr(found, name) == pytest.approx(getattr(truth, name), rel=1e-2), name
-
-
 def test_operators_that_only_drift_have_no_weight(data_of):
     """Means that differ from loop to loop do not become weights that no loop shows.
 

@@ -24,7 +24,6 @@ from hilctl.identify.model_selection import (
 from hilctl.identify.pipeline import settings_from
 from hilctl.identify.settings import FitSettings
 from hilctl.models.plays import PpiModel
-from tests.published import terfenol_rdpi
 
 MODEL = PpiModel(direct=4.0, weights=(1.0,), thresholds=(0.5,))
 GRID = [(a, f) for a in (2.0, 4.0, 6.0) for f in (10.0, 50.0, 100.0)]
@@ -259,18 +258,6 @@ def test_smallest_order_that_is_as_good_is_chosen(loops):
     (own,) = (error for error in errors if error.plays == chosen.plays)
     assert own.rms_percent <= 1.03 * least
     assert own.deadbands_a_side == chosen.deadbands
-
-
-@pytest.mark.slow
-def test_models_without_deadbands_have_none(loops_of):
-    data = loops_of(terfenol_rdpi(), [(2.3, f) for f in (1.0, 50.0, 100.0, 200.0)], 150)
-    settings = FitSettings(kind="rdpi", weight_by="equal", size="auto")
-    found = select(FitRequest(data, settings))
-    chosen, errors = found.settings, found.orders
-    assert chosen.plays in {error.plays for error in errors}
-    assert all(error.deadbands_a_side == 0 for error in errors)
-    with pytest.raises(DataError, match="too few data"):
-        select(FitRequest(data[:3], settings))
 
 
 @pytest.mark.slow

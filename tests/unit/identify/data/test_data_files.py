@@ -18,12 +18,8 @@ from hilctl.identify.data.data_files import (
     without_gaps,
 )
 from hilctl.identify.data.records import History, SteadyLoop
-from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import FitRequest
-from hilctl.identify.fit_model import fit_model
 from hilctl.identify.pipeline import settings_from
 from hilctl.identify.settings import TableSettings
-from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 GOLDEN = Path(__file__).parents[4] / "recordings" / "golden"
 CURRENT, VOLTAGE = GOLDEN / "terfenol_uncompensated.mcap", GOLDEN / "piezo_compensated.mcap"
@@ -97,35 +93,6 @@ def test_skipped_samples_hold_the_command(recording_of, edges):
     command, displacement_um = without_gaps(recording, 100, 900)
     np.testing.assert_array_equal(command, history.command[100:900])
     np.testing.assert_array_equal(displacement_um, history.displacement_um[100:900])
-
-
-@pytest.mark.slow
-def test_skipped_samples_cost_little_accuracy(make_recording):
-    rate_hz, rng = 1000.0, np.random.default_rng(1)
-    time = np.arange(8000) / rate_hz
-    wave = sum(np.sin(2.0 * np.pi * (f * time + rng.uniform())) for f in (0.7, 1.7, 3.1, 7.0, 13.0))
-    wanted = 6.0 * np.minimum(2.0 * time, 1.0) * wave / np.abs(wave).max()
-    skipped = np.unique(np.add.outer(rng.integers(100, 7990, 12), np.arange(3)))
-
-    def run(index):
-        held = wanted[index[np.searchsorted(index, np.arange(8000), side="right") - 1]]
-        displacement_um, current_a = np.empty_like(held), np.empty_like(held)
-        TerfenolActuator(TerfenolParameters(), rate_hz, seed=3).step(
-            held, displacement_um, current_a
-        )
-        recording = make_recording(
-            displacement_um[index], command=held[index], index=index, sample_rate_hz=rate_hz
-        )
-        recording.samples.flags[1:][np.diff(index) > 1] |= Flag.AFTER_SKIPPED.value
-        return history_from_pieces([recording])
-
-    complete, gappy = run(np.arange(8000)), run(np.delete(np.arange(8000), skipped))
-    settings = settings_from("field", ["drags=0", "plays=8", "cells=12", "knots=16"])
-    errors = [
-        judge(fit_model(FitRequest([history], settings)).model, [complete]).rms_percent
-        for history in (complete, gappy)
-    ]
-    assert errors[1] <= 1.2 * errors[0]
 
 
 def test_readings_that_are_no_numbers_are_missing_too(recording_of):
@@ -227,16 +194,6 @@ def test_quotes_comments_and_blank_lines(tmp_path):
     assert (history.sample_rate_hz, history.ignore) == (5.0, 1)
 
 
-def test_times_rounded_in_the_text_are_fine(tmp_path):
-    """A 3 kHz time column with 4 decimals has uneven steps and still gives 3 kHz."""
-    lines = [f"{k / 3000:.4f},{k % 5},{k % 3}" for k in range(301)]
-    history = table(write(tmp_path, lines), 2, 3, time_column=1)
-    assert history.sample_rate_hz == pytest.approx(3000.0)
-    assert history.label == "t.csv"
-    with pytest.raises(DataError, match="evenly spaced"):
-        table(write(tmp_path, [*lines[:100], *lines[101:]]), 2, 3, time_column=1)
-
-
 def test_units_are_those_of_the_columns(tmp_path):
     lines = [f"{5 * k},{k},{2 * k},{k / 4}" for k in range(20)]
     path = write(tmp_path, ["t [ms],drive [mA],gap [nm],monitor [V]", *lines])
@@ -265,18 +222,6 @@ def test_rate_or_time_not_both(tmp_path):
         table(path, 2, 3)
     with pytest.raises(DataError, match="got both"):
         table(path, 2, 3, time_column=1, rate_hz=100.0)
-
-
-def test_unreadable_and_empty_tables(tmp_path):
-    binary = tmp_path / "b.csv"
-    binary.write_bytes(b"\x01\x00\x80")
-    for path, reason in ((tmp_path / "none.csv", "no such file"), (binary, "not a text table")):
-        with pytest.raises(InputError, match=reason):
-            table(path, 1, 2, rate_hz=1.0)
-    with pytest.raises(DataError, match="no rows"):
-        table(write(tmp_path, ["v,y"]), 1, 2, rate_hz=1.0)
-    with pytest.raises(DataError, match="40 rows"):
-        table(write(tmp_path, rows(",")), 2, 3, rate_hz=1.0, first_row=51)
 
 
 @pytest.mark.parametrize(

@@ -15,7 +15,6 @@ from hilctl.identify.field.duhem_search import (
     FLUX,
     HIGHEST,
     LOWEST,
-    MARGIN,
     NAMES,
     POINTS,
     POWERS,
@@ -82,15 +81,6 @@ def logs_of(here: Layout, bend: float = 0.0) -> F64:
     return np.stack([0.01 * y + 0.3 * off + bend * off**2, 0.02 * y - 0.2 * off])
 
 
-def test_nodes_reach_beyond_the_data_by_the_margin():
-    path, here = loops(), layout()
-    room = MARGIN * np.ptp(path.displacement_um)
-    assert here.nodes_um[0] == pytest.approx(path.displacement_um.min() - room)
-    assert here.nodes_um[-1] == pytest.approx(path.displacement_um.max() + room)
-    assert here.nodes_um.size == here.centre.size == 13
-    assert here.offsets.size == here.across == 7
-
-
 def test_the_centre_is_the_middle_of_the_loops_and_the_band_holds_all():
     path, here = loops(), layout()
     inside = (here.nodes_um > -55.0) & (here.nodes_um < 35.0)
@@ -122,13 +112,6 @@ def test_a_table_moved_to_other_nodes_is_the_same_function():
     within = np.abs(fine.offsets[None, :] - shift[:, None]) < coarse.half_width
     expected -= np.array([0.3, -0.2])[:, None, None] * shift[:, None]
     assert moved[:, within] == pytest.approx(expected[:, within], abs=1e-9)
-
-
-def test_a_search_begins_within_its_bounds():
-    assert FIRST.size == len(NAMES)
-    assert (FIRST >= LOWEST).all()
-    assert (FIRST <= HIGHEST).all()
-    assert FIRST[NAMES.index("output")] > 0.0  # or the flux would make no difference at first
 
 
 def test_the_flux_rises_over_the_stroke_whatever_its_row():
@@ -268,13 +251,6 @@ def test_units_make_no_difference():
     other_x, other_logs = other_job._descend(FIRST, other_first, 3, 0.0)
     assert other_x == pytest.approx(x, abs=1e-4)
     assert other_logs - np.log(0.5) == pytest.approx(logs, abs=1e-2)
-
-
-def test_progress_rises_below_1():
-    seen: list[float] = []
-    DuhemSearch(data(), 6, 4, 0.05).find(lambda part, _: seen.append(part))
-    assert seen == sorted(set(seen))
-    assert 0.0 < seen[0] < seen[-1] < 1.0
 
 
 def test_a_search_that_goes_on_from_a_rougher_one_ends_no_worse():
