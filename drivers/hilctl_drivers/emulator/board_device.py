@@ -25,8 +25,7 @@ class EmulatedBoard(SerialDevice):
         self, profile: FrameProfile, bench: Bench, output: str | None, sensor: str | None
     ) -> None:
         self._name, self._range = next(iter(profile.outputs.items()))
-        super().__init__(profile, bench, output)
-        self._sensor = sensor
+        super().__init__(profile, bench, output, sensor)
         self._outputs = BoardValues(self._range)
         self._inputs = BoardValues(next(iter((profile.inputs or profile.outputs).values())))
         streaming = profile.streaming

@@ -131,7 +131,7 @@ class LabJackStream:
 
     def _played(self, first: int, command: F64, displacement_um: F64, now_ns: int) -> None:
         self._on_played(first, command, now_ns)
-        volts = np.zeros((displacement_um.size, self._inputs))  # other inputs are at 0 V
+        volts = np.repeat(self._wiring.output(command)[:, None], self._inputs, axis=1)
         volts[:, 0] = self._wiring.at_terminal(displacement_um)
         self.input.keep(volts.ravel())
 

@@ -107,8 +107,7 @@ class EmulatedModbus(EmulatedDevice):
         sensor: str | None,
         command: float | None = None,
     ) -> None:
-        super().__init__(profile, bench, output)
-        self._sensor = sensor
+        super().__init__(profile, bench, output, sensor)
         self.memory = RegisterMap(profile)
         self._steps = self.memory.steps
         self._outputs, self._inputs = self.memory.outputs, self.memory.inputs
@@ -252,19 +251,13 @@ class EmulatedModbus(EmulatedDevice):
         return found
 
     def _measure(self) -> None:
+        for name, source in self.profile.inputs.items():
+            self._inputs[name].value = self._reading(name, source)
         if self._sensor is not None:
-            value = float(self.wiring.at_terminal(self._rig.displacement_um))
-            self._inputs[self._sensor].value = value
             validity = self.profile.inputs[self._sensor].validity
             if validity != "none":
                 bits = validity.valid ^ (validity.mask * self._is_invalid)
                 self._steps[id(validity)].set_bits(validity.mask, bits)
-        for name, source in self.profile.inputs.items():
-            if source.measures == "output" and self._output is not None:
-                same = source.unit == self.profile.outputs[self._output].unit
-                value = self._outputs[self._output].value
-                value = value if same else self.wiring.command(value)
-                self._inputs[name].value = min(max(value, source.min), source.max)
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.tripped != "none":
             self._steps[id(watchdog.tripped)].words[-1] = watchdog.tripped.mask * self.tripped

@@ -71,6 +71,12 @@ class SimulatedWiring(SignalChain):
         clipped: F64 = np.clip(signal, *self.input.limits)
         return clipped
 
+    def monitor(self, command: F64, source: Range) -> F64:
+        """Return what an input at the output reads; in another unit it reads the command."""
+        signal = self.output(command) if source.unit == self._output_unit else command
+        clipped: F64 = np.clip(signal, source.min, source.max)
+        return clipped
+
     @classmethod
     def spread(
         cls, output: Range, sensor_input: Range, actuator: SimulatedDevice
@@ -160,14 +166,19 @@ class Bench:
 
 
 class EmulatedDevice(ABC):
-    """A device on a bench; ``output`` drives the rig, None if another device does."""
+    """A device on a bench.
+
+    ``output`` drives the rig, and ``sensor`` shows its displacement; None if another device does.
+    """
 
     profile: BaseProfile
 
-    def __init__(self, profile: BaseProfile, bench: Bench, output: str | None) -> None:
+    def __init__(
+        self, profile: BaseProfile, bench: Bench, output: str | None, sensor: str | None
+    ) -> None:
         self.profile = profile
         self.wiring, self._rig, self._log = bench.wiring, bench.rig, bench.log
-        self._output = output
+        self._output, self._sensor = output, sensor
         self._logged = COLUMNS["command"].field(bench.wiring.command_unit).name
         self._timer = WatchdogTimer()
         self._now_ns = 0
@@ -197,6 +208,12 @@ class EmulatedDevice(ABC):
 
     def _advance(self) -> None:
         self._rig.advance(self._now_ns)
+
+    def _reading(self, name: str, source: Range) -> float:
+        """Return what an input reads: the displacement, or the output that all others are at."""
+        if name == self._sensor:
+            return float(self.wiring.at_terminal(self._rig.displacement_um))
+        return float(self.wiring.monitor(np.asarray(self._rig.command), source))
 
     def _set_terminal(self, name: str, value: float, event: str, now_ns: int) -> None:
         """Log an output's new value, and drive the rig if it is wired to it."""

@@ -14,7 +14,7 @@ class EmulatedStream(EmulatedDevice, EmulatedWire):
     profile: StreamProfile
 
     def __init__(self, profile: StreamProfile, bench: Bench, sensor: str) -> None:
-        super().__init__(profile, bench, None)
+        super().__init__(profile, bench, None, sensor)
         self.devices = (self,)
         self._source = profile.inputs[sensor]
         self._inputs = profile.inputs.values()

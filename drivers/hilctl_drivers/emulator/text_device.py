@@ -56,8 +56,7 @@ class EmulatedText(SerialDevice):
     def __init__(
         self, profile: AsciiProfile, bench: Bench, output: str | None, sensor: str | None
     ) -> None:
-        super().__init__(profile, bench, output)
-        self._sensor = sensor
+        super().__init__(profile, bench, output, sensor)
         self._address = profile.unit
         # The power-up value is 0 at the terminal, not at the actuator.
         self._values = {
@@ -161,17 +160,8 @@ class EmulatedText(SerialDevice):
         """Return the reply of that form with a reading, or the one that marks it as invalid."""
         if form.invalid != "none" and name == self._sensor and self._is_invalid:
             return form.invalid.example
-        return _with_number(form, reply, self._reading(name, source))
-
-    def _reading(self, name: str, source: AsciiInput) -> float:
-        if source.measures == "output":
-            value = self._values[self._output or next(iter(self._values))]
-        elif name == self._sensor:
-            value = float(self.wiring.at_terminal(self._rig.displacement_um))
-        else:
-            value = 0.0
-        value = min(max(value, source.min), source.max)
-        return source.number(value)
+        value = min(max(self._reading(name, source), source.min), source.max)
+        return _with_number(form, reply, source.number(value))
 
     def _watchdog(self, text: str) -> str | None:
         watchdog = self.profile.watchdog

@@ -516,18 +516,16 @@ class TestAux:
     def test_one_channel_per_exchange_in_turn(self, driven, variant):
         profile = variant((END, f"max: 10.0}}{self.INPUTS}\nwatchdog"))
         made = driven(profile, aux=dict(self.AUX))
-        inputs, device = made.emulated.device._inputs, made.device
-        inputs["TEMP"].value, inputs["FORCE"].value = 40.0, 50.0
+        device = made.device
         made.open()
         assert [(each.name, each.unit) for each in device.info.aux] == [
             ("coil_c", "°C"), ("preload_n", "N"),
         ]  # fmt: skip
         found = [device.aux.tolist()]
-        inputs["TEMP"].value, inputs["FORCE"].value = 60.0, 70.0
-        for _ in range(2):
-            made.exchange(0.0)
+        for _ in range(2):  # the emulated inputs read the command, and the output as a voltage
+            made.exchange(4.0)
             found.append(device.aux.tolist())
-        assert found == [[40.0, 101.0], [60.0, 101.0], [60.0, 141.0]]
+        assert found == [[0.0, 1.0], [4.0, 1.0], [4.0, 9.0]]
 
     @pytest.mark.parametrize(("changes", "words"), [
         ({"aux": {"coil_c": {"input": "AIN99"}}}, r"aux.coil_c.input.*AIN2.*LabJack T7.*'AIN99'"),
