@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 import numpy as np
+from pydantic_core import to_jsonable_python
 
 from hilctl.analysis.response.frequency_response import FrequencyResponse
 from hilctl.analysis.response.segment_spectrum import RestNoise
@@ -49,7 +50,8 @@ class Measured:
 
     def to_mapping(self) -> dict[str, Any]:
         """Return plain values without signals."""
-        return asdict(self, dict_factory=_without_signals)
+        made: dict[str, Any] = to_jsonable_python(asdict(self, dict_factory=_without_signals))
+        return made
 
 
 @dataclass(frozen=True, slots=True)
@@ -149,12 +151,12 @@ class Characterisation:
 
 
 def _without_signals(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
-    """Return fields as plain values, without arrays and tuples of arrays."""
+    """Return fields without arrays and tuples of arrays."""
     kept = {}
     for name, value in values:
-        many = list(value) if isinstance(value, tuple) else None
-        if not isinstance(many[0] if many else value, np.ndarray):
-            kept[name] = str(value) if isinstance(value, Path) else value if many is None else many
+        first = value[0] if isinstance(value, tuple) and value else value
+        if not isinstance(first, np.ndarray):
+            kept[name] = value
     return kept
 
 

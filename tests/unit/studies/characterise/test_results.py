@@ -15,7 +15,7 @@ from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.model_quality import Verdict
 from hilctl.identify.pipeline import identify_records
 from hilctl.identify.settings import FitSettings
-from hilctl.models.linear_stages import FirstMode
+from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.models.plays import PpiModel
 from hilctl.studies.characterise import results
 from hilctl.studies.characterise.loops import LoopFigures, ReversalCurves
@@ -29,8 +29,12 @@ from hilctl.studies.characterise.results import (
     validate,
 )
 from hilctl.studies.characterise.steps import STEPS
+from tests.unit.analysis.response.test_bode import SMALL
 
 NOTHING = np.empty(0)
+MODE = FurtherMode(
+    natural_hz=900.0, damping_ratio=0.02, antiresonance_hz=800.0, antiresonance_damping_ratio=0.02
+)
 UNSEEN = ValidationReference("random reference", 1.5, 0.4, 0.1, 0.2, *[NOTHING] * 4)
 LOOP = LoopFigures("sine", 1.0, 0.0, 5.0, -5.0, 5.0, None, 0.0, NOTHING, NOTHING)
 FOUND = Characterisation(
@@ -38,6 +42,7 @@ FOUND = Characterisation(
     steps=(StepRow("rest", "noise", 2.0, 0.1),),
     measured=Measured(
         rest=replace(rest_noise(np.arange(16.0), 5000.0), noise_um=0.03),
+        small=replace(SMALL, further=(MODE,)),
         growing=(LOOP,),
         reversal=ReversalCurves((0.5,), (np.zeros((2, 4)),), 0.01, 0.1),
     ),
@@ -89,6 +94,7 @@ def test_json_begins_with_the_held_out_error_and_has_no_signals():
     text = json.dumps(mapping, allow_nan=False)
     assert json.loads(text)["verdict"]["grade"] == "usable"
     assert json.loads(text)["measured"]["rest"]["noise_um"] == 0.03
+    assert json.loads(text)["measured"]["small"]["further"] == [MODE.model_dump()]
     assert "command" not in mapping["measured"]["growing"][0]
     assert "curves" not in mapping["measured"]["reversal"]
     assert mapping["measured"]["reversal"]["turns"] == [0.5]
