@@ -1,7 +1,8 @@
 """Parts of self-contained pages without scripts; figures are SVG elements.
 
-Figures have the width of a journal's column and text of 8 points; on paper they are smaller, two
-side by side. In dark mode their lightness is inverted.
+Figures have the width of a journal's column and text of 8 points; on paper they are smaller, and a
+page has two columns, except for tables of five columns or more. In dark mode the lightness of
+figures is inverted.
 """
 
 import html
@@ -60,17 +61,23 @@ th { font-weight: 600; white-space: nowrap; }
 td { font-variant-numeric: tabular-nums; }
 section td { overflow-wrap: anywhere; }
 .number { text-align: right; }
-td.number, td.word { white-space: nowrap; }
+td.number, td.word, td:first-child { white-space: nowrap; }
 pre { background: var(--pale); padding: .8rem; overflow-x: auto; font-size: .87rem; }
 summary { cursor: pointer; }
 dt { font-weight: 600; break-after: avoid; } dd { margin: 0 0 .4rem 1rem; break-inside: avoid; }
 .wide { overflow-x: auto; }
 .wide th { white-space: normal; }
 @page { margin: 12mm; }
-@media print { html { font-size: 8.5pt; } body { max-width: none; padding: 0; }
-  .figures, .side { columns: 2; column-gap: 5mm; } .figures svg { max-width: 68mm; }
-  h2 { break-after: avoid; } tr { break-inside: avoid; }
-  .wide { overflow: visible; } details { display: none; } }
+@media print { html { font-size: 8.5pt; } body { max-width: none; padding: 0; line-height: 1.3; }
+  main { columns: 2; column-gap: 5mm; } .figures, .side { columns: auto; }
+  h1, .file, .headline, .headline + p, .note, .bad, h2:has(+ .wide th:nth-child(5)),
+  main > .wide:has(th:nth-child(5)) { column-span: all; }
+  h2 { break-after: avoid; margin-top: 0; padding-top: 1rem; }
+  tr, main > .wide:not(:has(th:nth-child(5))) { break-inside: avoid; }
+  th, td { padding: .1rem .6rem .1rem 0; }
+  .side, .side section { margin: 0; break-inside: auto; } .figures svg { max-width: 66mm; }
+  .wide { overflow: visible; } .wide:has(th:nth-child(10)) { font-size: 72%; }
+  details { display: none; } }
 """
 
 _HEAD = """<!DOCTYPE html>
