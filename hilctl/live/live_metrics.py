@@ -69,10 +69,12 @@ class Headroom:
         self._next_sample = int(traces.index[-1]) + 1
         self._range("command", command, limits.command, unit)
         slews_per_s = self._slews_per_s(traces.index, command)
-        self._most("slew", slews_per_s, limits.slew_per_s, f"{unit}/s")
+        self._most("slew", np.abs(slews_per_s), limits.slew_per_s, f"{unit}/s")
         self._range("displacement", traces.values[ROW["displacement"]], limits.stroke_um, "um")
-        self._most("tracking error", traces.values[ROW["error"]], limits.tracking_error_um, "um")
-        self._most("measured - command", measured - command, limits.measured_deviation, unit)
+        error_um = np.abs(traces.values[ROW["error"]])
+        self._most("tracking error", error_um, limits.tracking_error_um, "um")
+        deviation = np.abs(measured - command)
+        self._most("measured - command", deviation, limits.measured_deviation, unit)
         for row, each in self._aux:
             if each.low is None:
                 self._most(each.name, traces.values[row], each.high, each.unit)
@@ -104,8 +106,8 @@ class Headroom:
     def _most(self, name: str, values: F64, limit: float | None, unit: str) -> None:
         values = values[np.isfinite(values)]
         if limit and values.size:
-            most = float(np.abs(values).max())
-            self._hold(Gauge(name, most / limit, most, limit, unit))
+            most = float(values.max())
+            self._hold(Gauge(name, max(most / limit, 0.0), most, limit, unit))
 
     def _hold(self, gauge: Gauge) -> None:
         oldest = self._next_sample - _HOLD_S * self._rate_hz

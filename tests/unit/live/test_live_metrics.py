@@ -1,6 +1,7 @@
 """Running metrics of a run, and the use of each limit."""
 
 import math
+from dataclasses import replace
 
 import numpy as np
 import pytest
@@ -9,7 +10,7 @@ from hilctl.base.samples import BlockBatch, BlockHeader, Flag
 from hilctl.base.segments import Segment
 from hilctl.live import live_metrics
 from hilctl.live.scope import ROW
-from hilctl.run.metadata import RunDescription
+from hilctl.run.metadata import AuxBounds, RunDescription
 from hilctl.run.start import checked_experiment
 from hilctl.signals.cycle_metrics import peak_hysteresis_percent
 from tests.unit.live.conftest import CONFIGS, traces
@@ -127,6 +128,15 @@ def test_use_of_each_limit(description):
     assert found["tracking error"] == 0.5
     assert found["late tick"] == 0.25
     assert "measured - command" not in found
+
+
+@pytest.mark.parametrize(("values", "part"), [([-90.0, 20.0], 0.25), ([-90.0], 0.0)])
+def test_only_a_highest_value_ignores_negative_ones(description, values, part):
+    bounds = AuxBounds(name="coil_c", unit="°C", low=None, high=80.0)
+    headroom = live_metrics.Headroom(description.model_copy(update={"aux": [bounds]}))
+    found = traces(0, command=np.zeros(len(values)))
+    headroom.add(replace(found, values=np.vstack((found.values, values))))
+    assert used(headroom)["coil_c"] == part
 
 
 def test_peak_is_held_for_a_second(description):
