@@ -30,7 +30,13 @@ from hilctl.experiment.open_loop import (
 )
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.feedback import Controller, Feedback, Gains, IntegralFeedback
+from hilctl.loop.feedback import (
+    MOST_GAIN_PER_BLOCK,
+    Controller,
+    Feedback,
+    Gains,
+    IntegralFeedback,
+)
 from hilctl.models.linear_stages import FirstMode
 from hilctl.waveforms.build import Reference
 
@@ -79,6 +85,13 @@ def feedback_problems(loaded: LoadedExperiment, preview: int) -> Iterator[Config
         yield loaded.problem("feedback", "needs a compensator, whose input it corrects")
     if loaded.response is not None:
         yield from _measured_problems(loaded, wanted)
+        most_hz = bandwidth_of(
+            wanted.kind, MOST_GAIN_PER_BLOCK / config.tick_s, config.sample_rate_hz
+        )
+        if isinstance(wanted, IntegralFeedbackConfig) and wanted.bandwidth_hz >= most_hz:
+            rule = f"must be < {most_hz:.4g} Hz, for a gain per block below {MOST_GAIN_PER_BLOCK:g}"
+            hint = "a smaller block allows more"
+            yield loaded.problem("feedback.bandwidth_hz", rule, f"{wanted.bandwidth_hz:g}", hint)
     if isinstance(wanted, PiFeedbackConfig):
         yield from _fast_problems(loaded, wanted, preview)
     elif loaded.response is None:

@@ -186,6 +186,10 @@ def _spanning(span: tuple[float, float], value: float) -> tuple[float, float]:
 _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED)
 
 
+MOST_GAIN_PER_BLOCK = 1.0
+"""Bound of the gain of :class:`IntegralFeedback`: a larger one overcorrects a gain of 1."""
+
+
 class IntegralFeedback(Controller):
     """Integral controller for blocks; it steps once per block.
 
@@ -198,8 +202,9 @@ class IntegralFeedback(Controller):
         self, gain_per_block: float, limit_um: float, due_after: int, shown_after: int
     ) -> None:
         super().__init__(limit_um, shown_after)
-        if not 0.0 < gain_per_block < 1.0:
-            raise InputError(f"gain_per_block must be > 0 and < 1: {gain_per_block}")
+        if not 0.0 < gain_per_block < MOST_GAIN_PER_BLOCK:
+            rule = f"must be > 0 and < {MOST_GAIN_PER_BLOCK:g}"
+            raise InputError(f"gain_per_block {rule}: {gain_per_block}")
         self._gain = gain_per_block
         self._before_due: F64 = np.full(due_after, math.nan)
 

@@ -131,6 +131,15 @@ response:
             check(resolve(Document("experiment", EXPERIMENT), tmp_path, settings))
         assert key in [problem.key for problem in caught.value.problems]
 
+    def test_a_gain_per_block_of_1(self, tmp_path):
+        (tmp_path / "model.yaml").write_text(MODEL)
+        facts = {"model": model_sha256(load_model(tmp_path / "model.yaml")), "phase": -180.0}
+        text = self.RESPONSE.format(last=2500.0, **facts).replace("1.0, 1.0", "0.1, 0.1")
+        (tmp_path / "response.yaml").write_text(text)
+        wanted = self.INTEGRAL.replace("1.0}", "16.0, response: response.yaml}")
+        rule = "feedback.bandwidth_hz: must be < 15.92 Hz"
+        assert rule in self.problems(tmp_path, "block=50", wanted)
+
     def test_unknown_kind(self, tmp_path):
         (tmp_path / "model.yaml").write_text(MODEL)
         with pytest.raises(ConfigError, match="'pi', 'integral'"):
