@@ -6,10 +6,11 @@ Numbers are kept bit for bit. CSV files have no place for the facts of the run.
 import json
 import re
 from collections import deque
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import suppress
 from dataclasses import dataclass, field
+from functools import partial
 from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import BinaryIO
@@ -23,6 +24,7 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable, make_folder, write_file
 from hilctl.base.samples import COLUMNS, RECORDED_FIELDS, RecordedField
 from hilctl.base.types import F64
+from hilctl.recording.metadata_keys import AUX_FACT
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.recording import Recording
 
@@ -174,15 +176,17 @@ def export_all(
     """Write each finished recording to ``output/name=NAME/date=DATE/FILE-RUN.parquet``.
 
     The files form one Hive-style data set with the same columns in all files. A column that a run
-    does not have is null, and so is NaN, which databases order above all numbers. Auxiliary
-    channels, which differ from run to run, are omitted. Files are written atomically and never
-    replaced; another call continues an interrupted export.
+    does not have is null, and so is NaN, which databases order above all numbers. The auxiliary
+    channels are those of all runs in the folder. Files are written atomically and never replaced;
+    another call continues an interrupted export.
 
     ``on_progress`` gets the completed share and the next recording. Raise InputError if the folder
     cannot be listed, a file cannot be written, or pyarrow is missing.
     """
     arrow()  # fails before any work is done
     entries = read_catalogue(folder)
+    keys = (key.split(".") for entry in entries for key in entry["options"] or ())
+    aux = sorted({key[1] for key in keys if key[0] == AUX_FACT})
     done = ExportedAll()
     sources: dict[Path, str] = {}
     for number, entry in enumerate(entries):
@@ -196,17 +200,20 @@ def export_all(
         elif target.exists():
             done.there += 1
         else:
-            _export_one(folder / path, target, path, done)
+            _export_one(folder / path, target, path, aux, done)
     on_progress(1.0, "")
     return done
 
 
-def _export_one(source: Path, target: Path, path: str, done: ExportedAll) -> None:
+def _export_one(
+    source: Path, target: Path, path: str, aux: Sequence[str], done: ExportedAll
+) -> None:
+    uniform = partial(_uniform, aux=aux)
     make_folder(target.parent)
     try:
         write_file(
             target,
-            lambda stream: write_pieces(RecordingStream(source), ParquetFile(stream), _uniform),
+            lambda stream: write_pieces(RecordingStream(source), ParquetFile(stream), uniform),
             overwrite=False,
         )
     except DataError as error:
@@ -232,7 +239,7 @@ def _escaped(text: str) -> str:
     return quote(text.encode()[:_MOST_BYTES], safe="")
 
 
-def _uniform(recording: Recording) -> Columns:
+def _uniform(recording: Recording, aux: Sequence[str]) -> Columns:
     pa = arrow()
     given = columns(recording)
     rows = given["sample"].size
@@ -243,5 +250,6 @@ def _uniform(recording: Recording) -> Columns:
         "run_id": pa.DictionaryArray.from_arrays(np.zeros(rows, dtype=np.int32), [run_id]),
         **{name: known[name] for name in ("sample", "t_s")},
         **{each.name: known.get(each.name, nulls) for each in RECORDED_FIELDS},
+        **{name: known.get(name, nulls) for name in (*aux, *recording.aux)},
         "flags": known["flags"],
     }
