@@ -6,7 +6,8 @@ correction, with half the gain and a smaller bandwidth.
 
 With a nearly exact compensator the response is close to a delay of some samples. The remaining
 resonance of the structure limits the bandwidth of a correction. The response is therefore a gain, a
-delay and one second-order resonance, fitted to the changes of each harmonic.
+delay and one second-order resonance, fitted to the changes of each harmonic. Where a harmonic has
+changed significantly, its measured response corrects the fit, which lacks further resonances.
 """
 
 import math
@@ -25,6 +26,8 @@ _COUPLING = 0.15
 
 _CLEAR = 4.0
 _FIRST_DOUBT = 0.05
+_FIT_DOUBT = 0.3
+"""Standard deviation of the fitted response at a harmonic, as a share of it."""
 
 # Parameters: log gain, delay in samples, (highest / natural frequency)^2, log damping ratio.
 _BELIEVED = np.array([0.0, 1.0, 0.0, math.log(0.2)])
@@ -240,9 +243,9 @@ def _backed_off(state: IlcState, base: IlcIteration) -> IlcState:
     return replace(state, gain=gain, widening=widening, reach_hz=reach_hz)
 
 
-def _response(state: IlcState) -> Response:
-    """Fit the response to all changes so far."""
-    changes = [
+def _changes(state: IlcState) -> list[Change]:
+    """Return the changes from run to run."""
+    return [
         Change(
             after.error.step_hz,
             after.correction_um - before.correction_um,
@@ -251,15 +254,32 @@ def _response(state: IlcState) -> Response:
         )
         for before, after in pairwise(state.trials)
     ]
+
+
+def _response(state: IlcState) -> Response:
+    """Fit the response to all changes so far."""
     error = state.trials[0].error
-    return fit(changes, (error.strongest_hz, error.answer), state.sample_rate_hz)
+    return fit(_changes(state), (error.strongest_hz, error.answer), state.sample_rate_hz)
+
+
+def _answer(state: IlcState, frequency: F64) -> C128:
+    """Return the mean of fitted and measured responses; the latter show what the fit lacks."""
+    fitted = state.response.at(frequency)
+    total_weight = (_FIT_DOUBT * np.abs(fitted)) ** -2.0
+    total: C128 = total_weight * fitted
+    for change in _changes(state):
+        changed_hz, measured, weight = change.points()
+        k = np.rint(changed_hz / change.step_hz).astype(np.int64)
+        total[k] += weight**2 * measured
+        total_weight[k] += weight**2
+    return total / total_weight
 
 
 def _moved(state: IlcState, base: IlcIteration) -> C128:
     """Return the correction one step from that of a run."""
     error = base.error
     frequency = np.arange(error.harmonics_um.size, dtype=np.float64) * error.step_hz
-    answer = state.response.at(frequency)
+    answer = _answer(state, frequency)
     inverse = np.conj(answer) / (np.abs(answer) ** 2 + _LEAST_ANSWER**2)
     step = inverse * error.harmonics_um * _above_noise(error) * _taper(frequency, state.reach_hz)
     moved: C128 = base.correction_um - state.gain * step

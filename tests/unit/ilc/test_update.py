@@ -85,6 +85,15 @@ def test_the_error_goes_to_the_noise_floor(response, coupling):
 
 
 @pytest.mark.slow
+def test_a_resonance_that_the_fit_lacks_is_learned():
+    """The fit has one resonance. The plant has another, on a harmonic, with a gain of 5."""
+    plant = Plant(RESONANT, 0.15)
+    second = Response(0.1, 2.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 1500.0) ** 2, 0.01)
+    plant._answer = 0.9 * plant._answer + second.at(FREQUENCY)
+    assert "noise floor" in learned(plant).done
+
+
+@pytest.mark.slow
 def test_it_stops_at_the_noise_floor():
     state = learned(Plant(Response()))
     assert "noise floor" in state.done
