@@ -17,6 +17,8 @@ import math
 from collections.abc import Iterator
 from typing import Annotated, Any, Literal, Self, TypeVar
 
+import numpy as np
+
 from hilctl.base.strict import Field, StrictModel
 from hilctl.kernels.dynamics import lag_block, lead_block, weigh_block
 from hilctl.models.base import HysteresisModel, Operator, Provenance
@@ -157,14 +159,18 @@ class StagedModel(HysteresisModel):
     def _unstructure(self, sample_rate_hz: float) -> Operator:
         """Return the inverse of the structure from derivatives of a smoothed displacement.
 
-        The exact inverse of the sampled structure is nearly unstable: it has a pole near -1.
+        The exact inverse of the sampled structure is nearly unstable: it has a pole near -1. The
+        complete smoothing, which includes its own second derivative, precedes the derivatives: so
+        the zeros of the inverse cancel the poles of the structure, and corners do not excite it.
         """
-        radian_s, damping = 0.0, 0.0
-        if self.structure is not None:
-            radian_s, damping = self.structure.radian_s, self.structure.damping_ratio
-        radian = radian_s * sample_rate_hz
-        width = max(self.smoothing_s * sample_rate_hz, radian)
-        weights, ahead = smoothing_weights(width, 2.0 * damping * radian, radian**2)
+        structure, width = self.structure, self.smoothing_s * sample_rate_hz
+        if structure is None:
+            weights, ahead = smoothing_weights(width)
+        else:
+            radian = structure.radian_s * sample_rate_hz
+            smoothing, ahead = smoothing_weights(max(width, radian))
+            undoing, one = smoothing_weights(0.0, 2.0 * structure.damping_ratio * radian, radian**2)
+            weights, ahead = np.convolve(smoothing, undoing), ahead + one
         inverse = Operator(weigh_block, (weights,), weights.size - 1)
         inverse.preview = ahead
         return inverse

@@ -106,7 +106,7 @@ def test_run_that_looks_ahead_is_identical(ahead):
     """What was fed is recorded, the reference ahead of its time, and gives the bits again."""
     preview = STAGED.inverse(ahead.sample_rate_hz).preview
     samples = ahead.samples
-    assert preview == 7
+    assert preview == 8
     assert (
         samples.reference_um[preview:4000].tolist() == samples.input_um[: 4000 - preview].tolist()
     )
@@ -133,7 +133,7 @@ def test_run_that_goes_on_after_another_is_identical(ahead, tmp_path):
     after = record(tmp_path, STAGED, 0.1, ahead.path)
     begun = Compensator(STAGED, ahead.sample_rate_hz)
     begun.restore(memory.state)
-    begun.begin(memory.lead_in(after.samples.reference_um[:7], 4000))
+    begun.begin(memory.lead_in(after.samples.reference_um[:8], 4000))
     assert after.starts[0].state.tolist() == begun.state().tolist()
     assert after.samples.input_um[0] == pytest.approx(memory.stands_um, rel=1e-3)
     assert after.run["initial_state_run_id"] == ahead.run["run_id"] != ""
