@@ -90,8 +90,9 @@ def _chosen(hz: F64, response: C128, noise: F64, rate_hz: float) -> OptimizeResu
         tries = worst_hz, *np.geomspace(2.0 * hz[0], hz[-1], _TRIES).tolist()
         starts = [[*start, math.log(each), *added] for each in tries]
         more = _best(hz, response, noise, rate_hz, starts)
-        natural_hz, damping = np.exp(more.x[len(start) : len(start) + 2])
-        plausible = natural_hz < hz[-1] and damping < most_damping
+        # An earlier mode may move, too: one beyond the lines is not supported by the data.
+        natural_hz = np.exp(more.x[[3, *range(5, more.x.size, MODE_NUMBERS)]])
+        plausible = natural_hz.max() < hz[-1] and math.exp(more.x[len(start) + 1]) < most_damping
         plausible &= math.exp(more.x[4]) < _MOST_DAMPING
         start = more.x.tolist()
         if plausible and more.cost < worth * found.cost:
