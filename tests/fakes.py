@@ -103,6 +103,8 @@ class FakeInfo:
     confirms: bool = True
     arm_s: float = 0.0
     aux: tuple = ()
+    digital_output: str = "DO"
+    digital_input: str = "DI"
 
 
 DESCRIBED = DeviceInfo(
@@ -237,6 +239,9 @@ class FakeHost:
     def heartbeat(self, next_sample, late_ticks):
         self.heartbeats.append(next_sample)
         return self.stop()
+
+    def starts_at(self, time_ns):
+        self.start_ns = time_ns
 
     def closing(self):
         self.closed = True

@@ -10,13 +10,13 @@ from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
 from pkgutil import resolve_name
-from typing import Any, ClassVar, Self, cast
+from typing import Any, ClassVar, Literal, Self, cast
 
 from hilctl.base.device import AuxChannel, DeviceInfo
 from hilctl.base.errors import InputError
 from hilctl_drivers.device import details_of
 from hilctl_drivers.endpoint import Endpoint, reader_of
-from hilctl_drivers.profile_base import Range
+from hilctl_drivers.profile_base import BaseProfile, Range
 from hilctl_drivers.signal_chain import (
     AuxInput,
     DacOptions,
@@ -61,6 +61,8 @@ class DacSetup:
         chain: Amplifier and sensor.
         measure: The input that measures the output; None if it is not measured.
         aux: The auxiliary channels.
+        digital_output: Digital output of the writer for triggers; None without one.
+        digital_input: Its digital input for triggers; None without one.
     """
 
     options: DacOptions
@@ -71,6 +73,8 @@ class DacSetup:
     chain: SignalChain
     measure: Any
     aux: tuple[AuxSource, ...]
+    digital_output: Any
+    digital_input: Any
 
     @classmethod
     def of(cls, options: DacOptions) -> Self:
@@ -88,7 +92,8 @@ class DacSetup:
             chain.measured(measure)
         check_watchdog(here.title, options, output, chain, here.watchdog)
         aux = tuple(_aux_source(*each, reader, writer) for each in (options.aux or {}).items())
-        setup = cls(options, writer, reader, output, sensor_input, chain, measure, aux)
+        digital = (_digital(options, here, "output"), _digital(options, here, "input"))
+        setup = cls(options, writer, reader, output, sensor_input, chain, measure, aux, *digital)
         if setup.reads_elsewhere:
             setup.check_timeout(setup.read_time)
         return setup
@@ -131,6 +136,20 @@ class DacSetup:
             found.append(partial(each.value, own.reader_on(shared)))
         return found
 
+    def digital_session(self, link: Link) -> Any:
+        """Return the session with the digital channels; None if none is in use."""
+        if self.digital_output is None is self.digital_input:
+            return None
+        return cast("type[SessionReader]", _reader_class(self.writer)).session_on(self.writer, link)
+
+    @property
+    def digital_time(self) -> WireTime | None:
+        """Time to set the digital output; None without one."""
+        if self.digital_output is None:
+            return None
+        reader = cast("type[SessionReader]", _reader_class(self.writer))
+        return reader.digital_time(self.writer.profile, self.digital_output)
+
     def check_timeout(self, wire: WireTime) -> None:
         """Raise InputError if an answer cannot come within the timeout."""
         timeout_s = self.options.timeout_s
@@ -140,12 +159,14 @@ class DacSetup:
     def after_reading(self, wire: WireTime) -> WireTime:
         """Return the time of a sample that ``wire`` writes, and that the reader reads before.
 
-        It includes the slowest auxiliary channel.
+        It includes the slowest auxiliary channel, and setting the digital output.
         """
         if self.aux:
             times = [_reader_class(e.holder).time(e.holder.profile, e.input) for e in self.aux]
             slowest = max(times, key=lambda each: each.total_s)
             wire = wire.then(slowest.named("for an auxiliary channel"))
+        if (pulse := self.digital_time) is not None:
+            wire = wire.then(pulse.named(f"to set {self.options.digital_output}"))
         if not self.reads_elsewhere:
             return wire
         read = self.read_time
@@ -212,6 +233,9 @@ class DacSetup:
             details=details,
             ages_readings=_reader_class(self.reader).AGES,
             aux=tuple(each.channel for each in self.aux),
+            digital_output=options.digital_output or "",
+            digital_output_s=0.0 if (pulse := self.digital_time) is None else pulse.total_s,
+            digital_input=options.digital_input or "",
             **more,
         )
 
@@ -232,6 +256,18 @@ def _aux_source(name: str, options: AuxInput, reader: Endpoint, writer: Endpoint
     known = [f"{', '.join(each.profile.inputs)} of {each.profile.title}" for each in holders]
     has = " or ".join(dict.fromkeys(known))
     raise InputError(f"aux.{name}.input must be an input: {has}, got {options.input!r}")
+
+
+def _digital(options: DacOptions, profile: BaseProfile, kind: Literal["output", "input"]) -> Any:
+    """Return a digital channel by its option; raise InputError if the device has none like it."""
+    name = getattr(options, f"digital_{kind}")
+    if name is None:
+        return None
+    if not (known := getattr(profile, f"digital_{kind}s", {})):
+        has = f"{profile.title} has no digital {kind} in its profile"
+        hint = "'hilctl devices' lists the profiles with one"
+        raise InputError(f"digital_{kind} must be omitted: {has}; {hint}")
+    return channel(f"digital_{kind}", name, known, profile.title)
 
 
 class SensorReader(ABC):
@@ -332,6 +368,11 @@ class SessionReader(SensorReader):
     @abstractmethod
     def session_on(endpoint: Endpoint, link: Link) -> Any:
         """Return a session with the device."""
+
+    @staticmethod
+    @abstractmethod
+    def digital_time(profile: Any, output: Any) -> WireTime:
+        """Return the time of setting a digital output."""
 
     def _identify(self) -> None:
         self._session.check_selftest()

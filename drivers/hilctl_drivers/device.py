@@ -10,6 +10,7 @@ import json
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Mapping, Sequence
+from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias
@@ -60,6 +61,7 @@ class DacDevice(ABC):
         """Newest values of the auxiliary channels."""
         self._aux_readers: Sequence[Callable[[], float]] = ()
         self._next_aux = 0
+        self._digital_is_low = False
         self._info = info
         self._title = title
         self._action = action
@@ -103,6 +105,11 @@ class DacDevice(ABC):
             self._aux_readers = self._readers_of_aux()
             for _ in self._aux_readers:
                 self._read_aux()
+            # A missing channel must show before the output moves.
+            if self._info.digital_output:
+                self._set_digital(high=False)
+            if self._info.digital_input:
+                self._read_digital()
         except DeviceError as error:
             raise self._failed("open", error, self._release) from None
         self._block = block
@@ -179,8 +186,27 @@ class DacDevice(ABC):
             self.reading_um = displacement_um.copy()
             displacement_um[:] = np.interp(displacement_um, *self._curve)
 
+    def set_digital(self, high: bool) -> None:
+        """Set the digital output, see :meth:`hilctl.base.device.DigitalDevice.set_digital`."""
+        self._digital_is_low = not high
+        try:
+            self._set_digital(high=high)
+        except DeviceError as error:
+            action = f"set {self._info.digital_output}"
+            raise self._failed(action, error, self._abandon) from None
+
+    def read_digital(self) -> bool:
+        """Return whether the digital input is high."""
+        try:
+            return self._read_digital()
+        except DeviceError as error:
+            action = f"read {self._info.digital_input}"
+            raise self._failed(action, error, self._abandon) from None
+
     def make_safe(self, command: float) -> None:
         """Set the output to ``command`` in one attempt and disconnect; the watchdog stays armed.
+
+        After the first write that succeeds, the digital output is set low, in one attempt.
 
         See :meth:`hilctl.base.device.Device.make_safe`.
 
@@ -195,7 +221,9 @@ class DacDevice(ABC):
         action = f"make safe, {self._output_name}"
         try:
             self._put_out(command)
+            self._reset_digital()
         except UnconfirmedError as error:
+            self._reset_digital()
             raise UnconfirmedError(str(self._error(action, str(error)))) from None
         except DeviceError as error:
             raise self._error(action, str(error)) from None
@@ -228,6 +256,21 @@ class DacDevice(ABC):
         k = self._next_aux
         self.aux[k] = self._aux_readers[k]()
         self._next_aux = (k + 1) % len(self._aux_readers)
+
+    def _reset_digital(self) -> None:
+        """Set the digital output low unless it is; once, because the safe ramp waits for it."""
+        if self._info.digital_output and not self._digital_is_low:
+            self._digital_is_low = True
+            with suppress(DeviceError):
+                self._set_digital(high=False)
+
+    def _set_digital(self, high: bool) -> None:
+        """Set the digital output of a device that has one."""
+        raise DeviceError("there is no digital output")
+
+    def _read_digital(self) -> bool:
+        """Return whether the digital input is high, of a device that has one."""
+        raise DeviceError("there is no digital input")
 
     def _longest_block(self) -> tuple[int, str]:
         """Return the most samples of an exchange, and the reason as text."""

@@ -303,6 +303,14 @@ class DacOptions(AddressOptions):
         description="auxiliary channels by name, such as coil_c; one of them is read per sample, in"
         " turn, which costs one more request",
     )
+    digital_output: str | None = Field(
+        default=None,
+        description="digital output for trigger.output, of the device with the output; low except"
+        " for pulses",
+    )
+    digital_input: str | None = Field(
+        default=None, description="digital input for trigger.start, of the device with the output"
+    )
     watchdog: WatchdogOptions | Literal["none"] = Field(
         description="the device's own; none if the device may hold its last output"
     )

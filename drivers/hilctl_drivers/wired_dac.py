@@ -57,6 +57,7 @@ class WiredDac(DacDevice):
         title = f"{self.KIND} {setup.writer.name} at {setup.writer.place}"
         action = self.ACTION.format(output=options.output, input=options.input)
         super().__init__(self._describe(), title, action, options.output)
+        self._digital = setup.digital_session(self._link)
 
     @abstractmethod
     def _prepare(self) -> None:
@@ -108,6 +109,12 @@ class WiredDac(DacDevice):
 
     def _readers_of_aux(self) -> Sequence[Callable[[], float]]:
         return self._setup.aux_readers(self._link, self._reader)
+
+    def _set_digital(self, high: bool) -> None:
+        self._digital.set_digital(self._setup.digital_output, high=high)
+
+    def _read_digital(self) -> bool:
+        return bool(self._digital.is_high(self._setup.digital_input))
 
     def _output(self) -> float | None:
         held = self._held()

@@ -118,6 +118,10 @@ class DeviceInfo:
             last exchange's readings before their correction as ``reading_um``.
         aux: Auxiliary channels. With any, the device has their newest values after an exchange as
             ``aux``, float64[len(aux)]; NaN is a missing value.
+        digital_output: Name of the digital output for triggers; empty without one. With a digital
+            output or input the device is a :class:`DigitalDevice`.
+        digital_output_s: Time to set it, in s; part of ``max_rate_hz``.
+        digital_input: Name of the digital input for triggers; empty without one.
     """
 
     name: str
@@ -147,6 +151,9 @@ class DeviceInfo:
     files: Mapping[str, str] = field(default_factory=dict)
     calibration: NamedCalibration | None = None
     aux: tuple[AuxChannel, ...] = ()
+    digital_output: str = ""
+    digital_output_s: float = 0.0
+    digital_input: str = ""
 
     @property
     def corrects_readings(self) -> bool:
@@ -308,6 +315,22 @@ class ReadableDevice(Protocol):
             DeviceError: The device is open, cannot be reached, is another device, or answers
                 wrongly.
         """
+        ...
+
+
+class DigitalDevice(Protocol):
+    """A device with digital channels for triggers.
+
+    Opening it sets the output low. :meth:`Device.make_safe` sets it low after a write of the safe
+    value or its ramp, in one attempt whose failure is ignored.
+    """
+
+    def set_digital(self, high: bool) -> None:
+        """Set the digital output, and await the answer; raise DeviceError as an exchange does."""
+        ...
+
+    def read_digital(self) -> bool:
+        """Return whether the digital input is high; raise DeviceError as an exchange does."""
         ...
 
 

@@ -43,6 +43,12 @@ ADAPTED = "adapted"
 Values: ``offset_um``, ``gain``, and the weights of the operator, see ``loop/adaptation.py``.
 """
 
+TRIGGERED = "triggered"
+"""Event code of the start by the digital input, at sample 0 and its time.
+
+Values: ``waited_s``, since the run was ready to start.
+"""
+
 LOST_READINGS = "lost_readings"
 """Event code at the end of a run in which readings of a sensor that sends unasked did not arrive.
 

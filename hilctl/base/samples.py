@@ -309,6 +309,8 @@ class Flag(IntFlag):
     """In the first block after skipped ticks, in which the output was constant."""
     INVERSE_OUT = 1 << 18
     """The inverse was bypassed, partly or completely, by a line."""
+    TRIGGER = 1 << 19
+    """The digital output was set with this sample, because a mark of the waveform is due."""
 
 
 NO_WAVEFORM = Flag.RAMP | Flag.CONDITION

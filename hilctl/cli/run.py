@@ -28,7 +28,7 @@ from hilctl.cli.console import compile_progress, console, listing, progress_bar,
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.device_rules import interlock_context
-from hilctl.experiment.file import label_settings
+from hilctl.experiment.file import Trigger, label_settings
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.live.server_process import served_beside
 from hilctl.loop.safe_output import describe
@@ -302,6 +302,8 @@ def print_forecast(checked: CheckedExperiment) -> None:
         )
     if aux := interlock_context(config, info).aux:
         rows["auxiliary"] = "; ".join(f"{each.channel.name}: {each}" for each in aux)
+    if config.trigger is not None:
+        rows["trigger"] = _trigger(config.trigger, checked)
     if info.safe_note:
         rows["safe value"] = info.safe_note
     if forecast.heating_rms_a is not None:
@@ -313,6 +315,22 @@ def print_forecast(checked: CheckedExperiment) -> None:
     for warning in checked.warnings:
         terminal.print(f"warning: {warning}", style="yellow")
     terminal.print("ready to run", style="green")
+
+
+def _trigger(trigger: Trigger, checked: CheckedExperiment) -> str:
+    """Return start, marks and cost of the triggers in words."""
+    info, config, parts = checked.loaded.device.info, checked.loaded.config, []
+    if trigger.start is not None:
+        parts.append(
+            f"starts with {info.digital_input} {trigger.start}, at most {trigger.timeout_s:g} s"
+        )
+    if trigger.output is not None:
+        marks = trigger.of(checked.reference.segments).marks.size
+        pulse = f"{info.digital_output} is high for one sample at each {trigger.output} ({marks})"
+        if info.digital_output_s:
+            pulse += f", in {1e3 * info.digital_output_s:.2g} of {1e3 * config.tick_s:.3g} ms"
+        parts.append(pulse)
+    return "; ".join(parts)
 
 
 def _recording(megabytes: float) -> str:

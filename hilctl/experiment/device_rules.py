@@ -52,6 +52,7 @@ def device_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
     yield from _pace_problems(loaded)
     yield from _watchdog_problems(loaded)
     yield from _interlock_problems(loaded)
+    yield from _trigger_problems(loaded)
 
 
 def _range_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
@@ -183,3 +184,18 @@ def _unmet(needs: InterlockRequirement, loaded: LoadedExperiment) -> Iterator[st
         yield "needs a compensator: without one there is no reference in um to track"
     if needs.measured and not info.measures_command:
         yield f"needs a device that measures its command: {info.name} does not"
+
+
+def _trigger_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
+    """Yield the triggers without a channel of the device, and a block that hides their sample."""
+    trigger, info = loaded.config.trigger, loaded.device.info
+    if trigger is None:
+        return
+    for key, name in (("output", info.digital_output), ("start", info.digital_input)):
+        wired = "input" if key == "start" else key
+        if getattr(trigger, key) is not None and not name:
+            rule = f"needs a digital {wired} of {info.name}: set device.digital_{wired} to one that"
+            hint = "'hilctl devices' lists the profiles with digital channels"
+            yield loaded.problem(f"trigger.{key}", f"{rule} its profile has", hint=hint)
+    if loaded.config.block > 1:
+        yield loaded.problem("block", "must be 1 with trigger", str(loaded.config.block))

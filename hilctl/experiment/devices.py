@@ -122,10 +122,11 @@ def profile_summaries() -> tuple[ProfileSummary, ...]:
 def _summary(name: str, path: str) -> ProfileSummary:
     data = load_document(Path(path)).data
     channels = []
-    for what in ("output", "input"):
-        if known := data.get(f"{what}s", {}).values():
-            units = "/".join(sorted({each["unit"] for each in known}))
-            channels.append(f"{len(known)} {units} {what}{'s' if len(known) > 1 else ''}")
+    for what in ("output", "input", "digital output", "digital input"):
+        if known := data.get(f"{what}s".replace(" ", "_"), {}).values():
+            units = "/".join(sorted({each["unit"] for each in known if "unit" in each}))
+            number = f"{len(known)} {units}" if units else f"{len(known)}"
+            channels.append(f"{number} {what}{'s' if len(known) > 1 else ''}")
     kind = data["link"]["kind"]
     title = f"{data['vendor']} {data['model']}"
     return ProfileSummary(name, title, ", ".join(channels), _PROTOCOLS.get(kind, kind))

@@ -7,6 +7,7 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from hilctl.base.device import DeviceOptions, VoltageLimit
 from hilctl.base.errors import ConfigError, ConfigProblem
+from hilctl.base.segments import Segment
 from hilctl.base.strict import (
     AfterValidator,
     BeforeValidator,
@@ -21,6 +22,7 @@ from hilctl.experiment.devices import device_class, known_devices
 from hilctl.loop.interlocks import InterlockSettings
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import USUAL_MISSED_SHARE
+from hilctl.loop.triggers import Level, MarkKind, Triggers, marks_of
 from hilctl.machine.rt_setup import Realtime
 from hilctl.recording.metadata_keys import RECORDINGS
 from hilctl.waveforms.spec import AnyWaveform
@@ -366,6 +368,34 @@ class Safe(StrictModel):
     at_start: float | None = None
 
 
+class Trigger(StrictModel):
+    """Digital channels of the device: a pulse at marks of the waveform, a start by an input.
+
+    Attributes:
+        output: Marks of the waveform with which ``device.digital_output`` is high for one sample:
+            the start of each ``cycle``, of each ``segment`` (part of a sequence), or of the ``run``
+            (its waveform). Default: no pulses.
+        start: Level of ``device.digital_input`` with which the run starts; the output is at the
+            safe value until then. Default: the run starts immediately.
+        timeout_s: Longest wait for that level; then the run ends with the event
+            ``start_timeout``.
+    """
+
+    output: MarkKind | None = None
+    start: Level | None = None
+    timeout_s: Annotated[float, Field(gt=0.0, le=86400.0)] = 60.0
+
+    @model_validator(mode="after")
+    def _does_something(self) -> Self:
+        if self.output is None and self.start is None:
+            raise ValueError("must have output or start, or both")
+        return self
+
+    def of(self, segments: Sequence[Segment]) -> Triggers:
+        """Return the triggers of a run with these segments of the waveform."""
+        return Triggers(marks_of(self.output, segments), self.start, self.timeout_s)
+
+
 class CompensatorConfig(StrictModel):
     """The model whose inverse drives the actuator.
 
@@ -407,6 +437,8 @@ class Experiment(StrictModel):
             ``limits.stroke_um``.
         feedback: Controller around the compensator. Default: none.
         adaptation: Adaptation of the compensator's model during the run. Default: none.
+        trigger: Digital output at marks of the waveform, and start by a digital input. Default:
+            none.
         limits: Limits of the run.
         safe: The safe value, and the safe ramp to it.
         timing: Policy for late ticks.
@@ -432,6 +464,7 @@ class Experiment(StrictModel):
     zero: bool = False
     feedback: FeedbackConfig | None = None
     adaptation: AdaptationConfig | None = None
+    trigger: Trigger | None = None
     limits: Limits
     safe: Safe = Field(default_factory=Safe)
     timing: Timing = Field(default_factory=Timing)

@@ -42,6 +42,7 @@ from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_validity import ExpectedError, RangeFindings, range_findings
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.lead_in import Conditioning
+from hilctl.loop.triggers import SHORTEST_CYCLE
 from hilctl.waveforms.build import Reference, build
 
 _log = logging.getLogger(__name__)
@@ -128,6 +129,7 @@ def check(
         forecast = forecast_of(loaded, reference, begun, conditioned, heat_a2)
     except ModelError as error:
         raise ConfigError([*problems, loaded.problem("compensator.model", str(error))]) from None
+    problems += _mark_problems(loaded, reference)
     problems += feedback_problems(loaded, begun.preview)
     problems += adaptation_problems(loaded, begun.preview)
     warnings = findings.warnings + adaptation_warnings(config, reference.segments)
@@ -147,6 +149,21 @@ def check(
     return CheckedExperiment(
         loaded, reference, forecast, begun, warnings, heat_a2, operator, findings.expected
     )
+
+
+def _mark_problems(loaded: LoadedExperiment, reference: Reference) -> list[ConfigProblem]:
+    """Return that the waveform has no cycles to mark, or marks that are too close."""
+    trigger = loaded.config.trigger
+    if trigger is None or trigger.output is None:
+        return []
+    marks = trigger.of(reference.segments).marks
+    if not marks.size:
+        rule = "must be segment or run: no part of the waveform is periodic"
+        return [loaded.problem("trigger.output", rule, trigger.output)]
+    if np.diff(marks).min(initial=SHORTEST_CYCLE) < SHORTEST_CYCLE:
+        rule = f"must be {SHORTEST_CYCLE} samples or more apart: raise sample_rate_hz"
+        return [loaded.problem("trigger.output", rule, trigger.output)]
+    return []
 
 
 def _warn_of_long_work(reference: Reference) -> None:

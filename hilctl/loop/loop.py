@@ -16,9 +16,9 @@ from typing import cast
 
 import numpy as np
 
-from hilctl.base.device import AgingDevice, Device, WatchdogDevice
-from hilctl.base.errors import DeviceError
-from hilctl.base.events import LOST_READINGS, OFFSET, ZERO, Event
+from hilctl.base.device import AgingDevice, Device, DigitalDevice, WatchdogDevice
+from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.events import LOST_READINGS, OFFSET, TRIGGERED, ZERO, Event
 from hilctl.base.samples import ANSWERS, BlockHeader, Flag
 from hilctl.base.types import F64, U32
 from hilctl.loop.block import Block
@@ -35,6 +35,7 @@ from hilctl.loop.safe_output import (
     describe,
     drive_to_safe,
 )
+from hilctl.loop.triggers import PulseOutput
 from hilctl.loop.tuning import ReferenceTuner, Tuning, TuningFactors, tune
 
 # Plain integers: access to an enumeration's member takes longer than the write.
@@ -42,6 +43,7 @@ _FIRST_SAMPLE, _SAMPLES = int(BlockHeader.FIRST_SAMPLE), int(BlockHeader.SAMPLES
 _DROPPED_BEFORE, _DEADLINE_NS = int(BlockHeader.DROPPED_BEFORE), int(BlockHeader.DEADLINE_NS)
 _LATE_NS, _EXCHANGE_NS = int(BlockHeader.LATE_NS), int(BlockHeader.EXCHANGE_NS)
 _SKIPPED, _CONDITION = int(Flag.AFTER_SKIPPED), int(Flag.CONDITION)
+_TRIGGER = int(Flag.TRIGGER)
 
 
 class _Phase(Enum):
@@ -88,6 +90,7 @@ class Loop:
         self._ended_at = 0
         self._before = LeadIn(None, 0)
         self._end = plan.samples
+        self._pulses: PulseOutput | None = None
         self._on_ramp = False
         self._missing = 0
         self._dropped = 0
@@ -110,6 +113,9 @@ class Loop:
         Returns:
             Samples before the waveform, whole blocks: the ramp to the safe value (none if the
             output is within one step of it), and the conditioning.
+
+        Raises:
+            InputError: The run waits for a trigger, and the output is not at the safe value.
         """
         self._limiter.last = output
         self._interlocks.begin_at(output)
@@ -117,6 +123,14 @@ class Loop:
         ramp_samples = -(-self._limiter.ramp_samples // block) * block
         self._before = before = LeadIn(conditioning, ramp_samples)
         self._end = before.waveform_at + self._plan.samples
+        if (triggers := self._plan.triggers) is not None:
+            if triggers.start is not None and ramp_samples:
+                rule = "a run that waits for trigger.start must begin at the safe value"
+                cure = "set it with 'hilctl safe'; nothing has moved"
+                raise InputError(f"{rule}, but the output is at {output:g}: {cure}")
+            if triggers.marks.size:
+                device = cast(DigitalDevice, self._device)
+                self._pulses = PulseOutput(device, triggers.marks + before.waveform_at)
         if before.waveform_at:
             self._phase = _STARTING if ramp_samples else _CONDITIONING
             self._pacer.policy = self._plan.start_policy
@@ -134,8 +148,11 @@ class Loop:
         elif self._phase is _CONDITIONING:
             self._record_condition()
         try:
-            self._start_ns = start_ns = self._armed(start_ns)
-            self._pacer.begin(start_ns)
+            triggered_ns = self._await_trigger(start_ns)
+            self._start_ns = self._armed(triggered_ns)
+            if triggered_ns > start_ns:
+                self._host.starts_at(self._start_ns)
+            self._pacer.begin(self._start_ns)
             while not self._tick():
                 pass
             self._phase = _HOLDING
@@ -147,6 +164,34 @@ class Loop:
         self._record_lost_readings()
         output: OutputState = "confirmed" if self._device.info.confirms else "sent"
         return LoopOutcome(self._code, self._reason, self._ended_at, output, self._dropped)
+
+    def _await_trigger(self, start_ns: int) -> int:
+        """Wait for the digital input, if the plan says so; return the time of the first tick.
+
+        Nothing is written meanwhile, and the device's watchdog is not armed yet. A stop or the
+        timeout ends the run with its safe ramp.
+        """
+        triggers, clock = self._plan.triggers, self._clock
+        if triggers is None or triggers.start is None:
+            return start_ns
+        device, name = cast(DigitalDevice, self._device), self._device.info.digital_input
+        period_ns = math.ceil(self._plan.block / self._plan.sample_rate_hz * 1e9)
+        clock.sleep_until_ns(start_ns)
+        while device.read_digital() != (triggers.start == "high"):
+            waited_s = (clock.now_ns() - start_ns) * 1e-9
+            if stop := self._host.heartbeat(0, 0):
+                self._begin_safe_ramp("stopped", "stopped", stop)
+                return clock.now_ns()
+            if waited_s >= triggers.timeout_s:
+                text = f"{name} was not {triggers.start} within {triggers.timeout_s:g} s"
+                self._begin_safe_ramp("fault", "start_timeout", text)
+                return clock.now_ns()
+            clock.sleep_until_ns(clock.now_ns() + period_ns)
+        now_ns = clock.now_ns()
+        values = {"waited_s": (now_ns - start_ns) * 1e-9}
+        text = f"started by {name}, {triggers.start} after {values['waited_s']:.3f} s"
+        self._host.record_event(Event(0, "info", TRIGGERED, text, values))
+        return now_ns
 
     def _armed(self, start_ns: int) -> int:
         """Arm the watchdog of the device; return the time of the first tick."""
@@ -331,6 +376,10 @@ class Loop:
         self._device.exchange(
             head[_FIRST_SAMPLE], sent.command, answered.displacement_um, answered.measured
         )
+        if self._pulses is not None:
+            active = self._phase is _FOLLOWING
+            if self._pulses.follow(head[_FIRST_SAMPLE], active=active):
+                sent.flags |= _TRIGGER
         head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
         if self._attributes:
             for name in self._attributes:

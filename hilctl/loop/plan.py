@@ -14,6 +14,7 @@ from hilctl.loop.interlocks import InterlockContext, InterlockSettings
 from hilctl.loop.lead_in import Conditioning
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import LatePolicy, LateRules
+from hilctl.loop.triggers import Triggers
 from hilctl.loop.tuning import Tuning
 
 
@@ -49,6 +50,7 @@ class LoopPlan:
     feedback: Controller | None = None
     adaptation: Adaptation | None = None
     conditioning: Conditioning | None = None
+    triggers: Triggers | None = None
     keep_all: bool = True
 
     @property
@@ -85,6 +87,10 @@ class Host(Protocol):
 
         ``next_sample`` is an index in the waveform; 0 before it begins.
         """
+        ...
+
+    def starts_at(self, time_ns: int) -> None:
+        """Note a later time of the first tick, before it: the run has waited for a trigger."""
         ...
 
     def closing(self) -> None:

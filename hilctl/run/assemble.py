@@ -1,10 +1,12 @@
 """The plan of the loop, from a checked experiment."""
 
 import math
+from collections.abc import Sequence
 from dataclasses import replace
 
 from hilctl.base.device import Device, DeviceInfo
 from hilctl.base.errors import InputError
+from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.experiment.closed_loop import make_adaptation, make_feedback
 from hilctl.experiment.device_rules import interlock_context
@@ -54,12 +56,14 @@ def assemble(
     operator: DisplacementOperator | None = None,
     paced: bool = True,
     heat_a2: float = 0.0,
+    segments: Sequence[Segment] = (),
 ) -> LoopPlan:
     """Return the plan of a run, with a warmed-up compensator.
 
     ``reference`` is in the waveform's unit, ``input_um`` is the compensator's input, float64[n]
     each. ``state`` is the compensator's before the first sample; None: at rest. No tick is late
-    without ``paced``. ``heat_a2`` is the heat of the coil before the run, in A^2.
+    without ``paced``. ``heat_a2`` is the heat of the coil before the run, in A^2. ``segments`` are
+    those of the waveform, for the marks of ``trigger.output``.
     """
     config, info = loaded.config, loaded.device.info
     rate_hz = config.sample_rate_hz
@@ -87,6 +91,7 @@ def assemble(
         feedback=make_feedback(config, compensator, info.latency_blocks),
         adaptation=make_adaptation(config, operator, compensator),
         conditioning=conditioning,
+        triggers=None if config.trigger is None else config.trigger.of(segments),
         keep_all=config.recording.on_failure == "stop",
     )
 

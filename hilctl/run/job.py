@@ -54,6 +54,7 @@ class Job:
     state: list[float] | None
     heat_a2: float  # heat of the coil before the run, in A^2
     stands_um: float | None  # modelled before the first sample; None if no offset is measured
+    segments: list[dict[str, Any]]  # of the waveform, for marks; empty without trigger.output
     adapted: list[Any] | None  # see DisplacementOperator.to_lists; None without adaptation
     safe_value: float
     ramp_per_s: float
@@ -84,6 +85,9 @@ class Job:
             state=None if begun.state is None else begun.state.tolist(),
             heat_a2=checked.heat_a2,
             stands_um=begun.stands_um,
+            segments=[each.to_mapping() for each in checked.reference.segments]
+            if loaded.config.trigger
+            else [],
             adapted=None if checked.operator is None else checked.operator.to_lists(),
             safe_value=limits.safe,
             ramp_per_s=limits.ramp_per_s,

@@ -16,6 +16,7 @@ import numpy as np
 from hilctl.base.device import Clock
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import TextFiles
+from hilctl.base.segments import Segment
 from hilctl.experiment.conditioning import conditioning_of
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.loop.adaptation import DisplacementOperator
@@ -69,6 +70,10 @@ class RingHost:
             return f"stopped because the supervisor was silent for {self._silence_ns * 1e-9:g} s"
         return ""
 
+    def starts_at(self, time_ns: int) -> None:
+        """Write the time of the first tick, which the recorder and watchers read."""
+        self._page.put(PageField.START_NS, time_ns)
+
     def closing(self) -> None:
         """Write the phase after the loop, in which the device may take its timeouts."""
         self._numbers[_HEARTBEAT_NS] = self.clock.now_ns()
@@ -117,6 +122,7 @@ def plan_of(job: Job, loaded: LoadedExperiment) -> LoopPlan:
         conditioning_of(loaded, job.stands_um),
         operator=None if job.adapted is None else DisplacementOperator.from_lists(job.adapted),
         heat_a2=job.heat_a2,
+        segments=[Segment(**each) for each in job.segments],
     )
 
 

@@ -75,7 +75,7 @@ class Recorder:
         try:
             # Before the file is opened for writing, which truncates an existing one.
             self._run = self._facts(start_unix_ns, set_up, waveform_at)
-            self._writer = RecordingWriter(self._file.begin(), self._run)
+            self._write_start()
         except OSError as error:
             raise InputError(self._cannot(reason(error))) from None
         compensated = self._checked.loaded.model is not None
@@ -84,6 +84,23 @@ class Recorder:
         # Before anything moves: the file may have been deleted.
         if not self.flush():
             raise InputError(self.error)
+
+    def _write_start(self) -> None:
+        self._writer = RecordingWriter(self._file.begin(), self._run)
+
+    def postpone(self, later_ns: int) -> None:
+        """Write the metadata again, before the first sample: the run began that much later."""
+        run, layout = self._run, self._run.layout
+        start_unix_ns = layout.start_unix_ns + later_ns
+        self._run = replace(
+            run,
+            facts={**run.facts, "started": iso_time(start_unix_ns)},
+            layout=replace(layout, start_unix_ns=start_unix_ns),
+        )
+        try:
+            self._write_start()
+        except OSError as error:
+            self._note_problem(error)
 
     def discard(self) -> None:
         """Remove the file if the run does not start; an existing one stays as it was."""
@@ -294,13 +311,15 @@ class RingRecorder:
         self._of_loop: deque[Event] = deque()
         self._outcome: LoopOutcome | None = None
         self._lost_loop = False
+        self._start_ns = 0
         self._ending = threading.Event()
         self._released_s = time.monotonic()
         self._before = ProcessUsage.now()
         self._thread = threading.Thread(target=self._run, name="recorder")
 
-    def start(self) -> None:
-        """Start the thread."""
+    def start(self, start_ns: int) -> None:
+        """Start the thread, for a run that begins at a monotonic time."""
+        self._start_ns = start_ns
         self._before = ProcessUsage.now()
         self._released_s = time.monotonic()
         self._thread.start()
@@ -358,9 +377,15 @@ class RingRecorder:
         # Before the samples: the ring then contains the samples that an event refers to.
         self._of_loop.extend(page.pop_events())
         for batch in self._ring.batches():
+            if (later_ns := page.get(PageField.START_NS) - self._start_ns) > 0:
+                recorder.postpone(later_ns)
+                self._start_ns += later_ns
             self.newest = batch.rows(slice(-1, None))
             recorder.batch(batch)
             took = True
+        # Before the first sample the start may still be postponed, which writes the file again.
+        if self.newest is None and not self._ending.is_set():
+            return took
         # After the samples: an event is recorded with the samples before it.
         while self._of_loop:
             recorder.event(self._of_loop.popleft())

@@ -307,7 +307,7 @@ class Supervisor:
             self._raise_if_stopped()
             # Before threads are started, so that they inherit it.
             stack.enter_context(favoured(child.pid))
-            recording.start()
+            recording.start(start_ns)
         except BaseException as error:
             child.kill()  # it waits for the start signal: nothing has moved
             if safety is not None:

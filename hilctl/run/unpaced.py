@@ -95,6 +95,9 @@ class OfflineHost:
         """Return the reason to stop, or an empty text."""
         return self._stop()
 
+    def starts_at(self, time_ns: int) -> None:
+        """Do nothing: the clock is virtual."""
+
     def closing(self) -> None:
         """Do nothing: there is no supervisor."""
 
@@ -144,6 +147,7 @@ def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, L
         operator=checked.operator,
         paced=False,
         heat_a2=checked.heat_a2,
+        segments=checked.reference.segments,
     )
 
     def refused() -> str:

@@ -49,7 +49,7 @@ class AsciiDac(SerialDac):
         # Half duplex: what was asked last is answered before the safe value can go out.
         write = exchange_time(profile, options.output, None)
         busy = self._own_time()
-        if setup.shares_link or setup.aux:
+        if setup.shares_link or setup.aux or setup.digital_output:
             busy = setup.after_reading(busy)
         self.longest_message_s = busy.answered_s + write.answered_s
         self.unconfirmed = self._unconfirmed()

@@ -328,6 +328,32 @@ class AsciiInput(ScaledRange, Query, MeasuredReply):
     )
 
 
+class AsciiDigitalOutput(StrictModel):
+    """A digital output, set by a line of text or a frame."""
+
+    high: LineTemplate = Field(description="line that sets it high")
+    low: LineTemplate = Field(description="line that sets it low")
+    reply: Reply | Literal["none"] = Field(
+        description="form of a good reply to both; none if there is none"
+    )
+
+
+class AsciiDigitalInput(StrictModel):
+    """A digital input, read with a line of text or a frame."""
+
+    ask: LineTemplate = Field(description="line that is sent")
+    high: Reply = Field(description="form of the reply if it is high")
+    low: Reply = Field(description="form of the reply if it is low")
+
+    @model_validator(mode="after")
+    def _differ(self) -> Self:
+        if self.high.match(self.low.example) or self.low.match(self.high.example):
+            raise ValueError("high and low must not match each other's example")
+        if self.high.lines != self.low.lines:
+            raise ValueError("high and low must have the same number of lines")
+        return self
+
+
 class AsciiExchange(MeasuredReply):
     """One write that sets an output and reads an input.
 
@@ -448,6 +474,8 @@ class AsciiProfile(BaseProfile):
         outputs: Outputs by name.
         inputs: Inputs by name.
         exchange: Lines that write and read in one transaction; none if there are none.
+        digital_outputs: Digital outputs by name, for pulses at marks of the waveform.
+        digital_inputs: Digital inputs by name, for the start of a run.
         init: Steps after the device is identified.
         close: Steps before the port is closed.
         watchdog: Host watchdog; none if it has none.
@@ -461,6 +489,8 @@ class AsciiProfile(BaseProfile):
     outputs: dict[Name, AsciiOutput]
     inputs: dict[Name, AsciiInput]
     exchange: AsciiExchange | Literal["none"]
+    digital_outputs: dict[Name, AsciiDigitalOutput] = Field(default={})
+    digital_inputs: dict[Name, AsciiDigitalInput] = Field(default={})
     errors: tuple[ErrorReply, ...] = Field(default=(), description="replies that report an error")
     error_query: Check | Literal["none"] = Field(
         default="none", description="query whether an earlier command has left an error"
@@ -504,13 +534,13 @@ class AsciiProfile(BaseProfile):
         """See :meth:`~hilctl_drivers.profile_base.BaseProfile.misfits`."""
         rule = "must be bytes in upper-case hexadecimal with a blank between, like 0A 1F"
         if isinstance(self.link, BytesLink):
-            for key, text in _texts(self.model_dump(), {"write", "ask", "text", "example"}):
+            for key, text in _texts(self.model_dump(), {*_REQUESTS, "example"}):
                 if not _is_bytes(text):
                     yield key, rule, repr(text)
 
     def requests(self) -> Iterator[tuple[str, str]]:
         """Yield the dotted key and the template of each request."""
-        return _texts(self.model_dump(), {"write", "ask", "text"})
+        return _texts(self.model_dump(), _REQUESTS)
 
     @property
     def unit(self) -> int:
@@ -526,6 +556,10 @@ class AsciiProfile(BaseProfile):
     def driver(self) -> str:
         """See :attr:`~hilctl_drivers.profile_base.BaseProfile.driver`."""
         return "hilctl_drivers.ascii.ascii_dac:AsciiDac"
+
+
+_REQUESTS = {"write", "ask", "text", "high", "low"}
+"""Keys of templates."""
 
 
 def _texts(data: Any, names: set[str], key: str = "") -> Iterator[tuple[str, str]]:

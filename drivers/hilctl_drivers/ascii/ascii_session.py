@@ -15,6 +15,8 @@ from typing import ClassVar, Literal, TypeAlias, cast
 from hilctl.base.errors import DeviceError
 from hilctl.base.formatting import printable
 from hilctl_drivers.ascii.ascii_profile import (
+    AsciiDigitalInput,
+    AsciiDigitalOutput,
     AsciiInput,
     AsciiLink,
     AsciiProfile,
@@ -290,6 +292,19 @@ class AsciiSession:
         """Return a function that asks for the value of an input."""
         return partial(self.value, source)
 
+    def set_digital(self, output: AsciiDigitalOutput, high: bool) -> None:
+        """Set a digital output."""
+        text = self.text(output.high if high else output.low)
+        if output.reply == "none":
+            self.send(text)
+        else:
+            self.ask(text, output.reply)
+
+    def is_high(self, source: AsciiDigitalInput) -> bool:
+        """Ask whether a digital input is high."""
+        found = self.query(self.text(source.ask), source.high, source.low)
+        return source.high.match(found.string) is not None
+
     def run(self, steps: Sequence[AsciiStep], **values: float) -> None:
         """Execute steps with ``timeout`` and ``safe``; raise DeviceError if one fails."""
         for step in steps:
@@ -435,6 +450,12 @@ def query_time(profile: AsciiProfile, query: AsciiInput) -> WireTime:
     return _lines_time(profile, [_question(profile, query)], query.settle_s)
 
 
+def digital_time(profile: AsciiProfile, output: AsciiDigitalOutput) -> WireTime:
+    """Return the time to set a digital output, with the longer line."""
+    texts = (fill(each, address=profile.unit) for each in (output.high, output.low))
+    return _lines_time(profile, [(max(texts, key=len), _example(output.reply))])
+
+
 class TextReader(SessionReader):
     """A :class:`~hilctl_drivers.dac_setup.SensorReader` for lines of text."""
 
@@ -447,6 +468,8 @@ class TextReader(SessionReader):
     def time(profile: AsciiProfile, source: AsciiInput) -> WireTime:
         """See :meth:`~hilctl_drivers.dac_setup.SensorReader.time`."""
         return query_time(profile, source).named(f"to {profile.title}")
+
+    digital_time = staticmethod(digital_time)
 
 
 def feed_time(profile: AsciiProfile) -> WireTime | None:

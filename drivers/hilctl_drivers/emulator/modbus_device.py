@@ -200,6 +200,9 @@ class EmulatedModbus(EmulatedDevice):
             # What is cleared by a step keeps the terminals until then.
             if each is words and not (self.tripped and self._holds_trip):
                 self._put_out(name, "write", self._now_ns)
+        for name, output in self.profile.digital_outputs.items():
+            if self._steps[id(output)] is words:
+                self._log.event(self._now_ns, "digital", output=name, value=words.value)
 
     @property
     def _holds_trip(self) -> bool:
@@ -258,6 +261,8 @@ class EmulatedModbus(EmulatedDevice):
             if validity != "none":
                 bits = validity.valid ^ (validity.mask * self._is_invalid)
                 self._steps[id(validity)].set_bits(validity.mask, bits)
+        for digital in self.profile.digital_inputs.values():
+            self._steps[id(digital)].value = float(self.digital_input)
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.tripped != "none":
             self._steps[id(watchdog.tripped)].words[-1] = watchdog.tripped.mask * self.tripped

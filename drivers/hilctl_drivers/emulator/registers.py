@@ -7,6 +7,7 @@ from typing import TypeAlias
 from hilctl_drivers.emulator.wire import RejectedRequest
 from hilctl_drivers.modbus.modbus_profile import ModbusOutput, ModbusProfile
 from hilctl_drivers.modbus.register_map import (
+    DigitalRegister,
     ExpectStep,
     ModbusSelftest,
     Register,
@@ -143,7 +144,7 @@ class RegisterMap:
         return words
 
     def _place_rest(self) -> None:
-        """Place the self-test, the status registers, and what the profile's steps touch."""
+        """Place self-test, status, digital channels, and what the profile's steps touch."""
         watchdog = self._profile.watchdog
         flag = None if watchdog == "none" else watchdog.tripped
         for _, register in self._profile.registers():
@@ -156,6 +157,8 @@ class RegisterMap:
                 words.value = register.expect
             elif isinstance(register, StatusRegister):
                 words = self._place(register, write=register is not flag)
+            elif isinstance(register, DigitalRegister):
+                words = self._place(register)
             else:
                 continue
             self.steps[id(register)] = words

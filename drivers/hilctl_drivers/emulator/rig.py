@@ -186,6 +186,11 @@ class EmulatedDevice(ABC):
         """Time until which the sensor's readings are marked as invalid."""
 
     @property
+    def digital_input(self) -> bool:
+        """Whether the digital inputs are high: every other second, for a start by one of them."""
+        return self._now_ns // 10**9 % 2 == 1
+
+    @property
     def _is_invalid(self) -> bool:
         return self._now_ns < self.invalid_until_ns
 

@@ -79,7 +79,11 @@ class EmulatedText(SerialDevice):
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.kick == "any":
             self._timer.fed_ns = self._now_ns
-        for part in (self._outputs, self._queries, self._watchdog, self._questions, self._steps):
+        parts = (
+            self._outputs, self._queries, self._digital, self._watchdog, self._questions,
+            self._steps,
+        )  # fmt: skip
+        for part in parts:
             found = part(text)
             if found is not None:
                 return EmulatedReply(found.encode() or None)
@@ -126,6 +130,17 @@ class EmulatedText(SerialDevice):
         source = self.profile.inputs[combined.input]
         reply = self._said(combined.input, source, combined)
         return self._set(combined.output, fields["value"], reply)
+
+    def _digital(self, text: str) -> str | None:
+        for name, output in self.profile.digital_outputs.items():
+            for value, template in ((1.0, output.high), (0.0, output.low)):
+                if self._matches(template, text):
+                    self._log.event(self._now_ns, "digital", output=name, value=value)
+                    return "" if output.reply == "none" else output.reply.example
+        for source in self.profile.digital_inputs.values():
+            if self._matches(source.ask, text):
+                return (source.high if self.digital_input else source.low).example
+        return None
 
     def _set(self, name: str, number: float, reply: str) -> str:
         watchdog, output = self.profile.watchdog, self.profile.outputs[name]

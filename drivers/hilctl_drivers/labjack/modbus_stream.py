@@ -254,6 +254,9 @@ class ModbusStream(ModbusDevice):
             raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
         if self._setup.reads_elsewhere:
             raise InputError("reader must be omitted: input and output are in one scan list")
+        for key in ("digital_output", "digital_input"):
+            if getattr(options, key) is not None:
+                raise InputError(f"{key} must be omitted: take kind: modbus_dac, and block: 1")
         aux = options.aux or {}
         for what, name, known in (
             ("output", options.output, streaming.outputs),

@@ -10,6 +10,7 @@ from hilctl.base.strict import StrictModel
 from hilctl_drivers.modbus.register_map import (
     AddressBase,
     Channel,
+    DigitalRegister,
     ModbusSelftest,
     ModbusStep,
     Register,
@@ -225,6 +226,12 @@ class ModbusProfile(BaseProfile):
     )
     outputs: dict[Name, ModbusOutput] = Field(description="analogue outputs by name")
     inputs: dict[Name, ModbusInput] = Field(description="analogue inputs by name")
+    digital_outputs: dict[Name, DigitalRegister] = Field(
+        default={}, description="digital outputs by name, for pulses at marks of the waveform"
+    )
+    digital_inputs: dict[Name, DigitalRegister] = Field(
+        default={}, description="digital inputs by name, for the start of a run"
+    )
     init: tuple[ModbusStep, ...] = Field(default=(), description="steps after connecting")
     close: tuple[ModbusStep, ...] = Field(default=(), description="steps before disconnecting")
     watchdog: ModbusWatchdog | Literal["none"] = Field(description="the device's own, or none")
@@ -272,6 +279,11 @@ class ModbusProfile(BaseProfile):
             overlap = at < behind + two.words and behind < at + one.words
             if one.area == two.area and overlap and not alike:
                 raise ValueError(f"the registers of {name} and {other} overlap: {at} and {behind}")
+        for name, output in self.digital_outputs.items():
+            if output.area not in {"coil", "holding"}:
+                raise ValueError(
+                    f"digital_outputs.{name}.area must be coil or holding, got {output.area}"
+                )
         for name, channel in self.inputs.items():
             if self.exchange == 23 and channel.area != "holding":
                 raise ValueError(f"inputs.{name}.area must be holding: exchange 23 reads holding")

@@ -41,6 +41,7 @@ from hilctl_drivers.modbus.pdu import (
     write_single_pdu,
 )
 from hilctl_drivers.modbus.register_map import (
+    DigitalRegister,
     EnsureStep,
     ExpectStep,
     ModbusStep,
@@ -365,6 +366,14 @@ class ModbusSession:
         request, decode = self.prepare(read_request(self.profile, source)), self.decoder(source)
         return lambda: decode(self.call(request))
 
+    def set_digital(self, output: DigitalRegister, high: bool) -> None:
+        """Write 1 or 0 to a digital output."""
+        self.write_bytes(output, _encoded(output, float(high)))
+
+    def is_high(self, source: DigitalRegister) -> bool:
+        """Return whether a digital input is not 0."""
+        return any(self.read_bytes(source))
+
     def error_check(self) -> Callable[[], None] | None:
         """Return a function that raises RefusedError if the error register is not 0, if any."""
         register = self.profile.error_register
@@ -415,6 +424,11 @@ def exchange_time(
 def read_time(profile: ModbusProfile, source: ModbusInput) -> WireTime:
     """Return the time to read an input."""
     return _requests_time(profile, read_requests(profile, source), source.settle_s)
+
+
+def digital_time(profile: ModbusProfile, output: DigitalRegister) -> WireTime:
+    """Return the time to set a digital output."""
+    return _requests_time(profile, [write_request(profile, output)])
 
 
 def read_requests(profile: ModbusProfile, sensor: ModbusInput) -> list[bytes]:
@@ -485,3 +499,4 @@ class ModbusReader(SessionReader):
 
     session_on = staticmethod(session_at)
     time = staticmethod(read_time)
+    digital_time = staticmethod(digital_time)

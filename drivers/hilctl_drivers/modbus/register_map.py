@@ -235,6 +235,10 @@ class Channel(Register, Range):
         return abs(self.scale) * 2.0**self.ignored_low_bits if whole else 0.0
 
 
+class DigitalRegister(Register):
+    """A digital channel: a bit, or a register that is 0 if it is low and 1 if it is high."""
+
+
 class ModbusSelftest(Register):
     """A register with a known value, to detect a wrong address base, word order or device."""
 

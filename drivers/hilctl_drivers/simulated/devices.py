@@ -118,6 +118,8 @@ class SimulatedDevice(DacDevice):
             simulated=True,
             details=details_of(details),
             calibration=calibration,
+            digital_output="DO",
+            digital_input="DI",
             **info,
         )
         super().__init__(described, described.name, "exchange a block", "the output")
@@ -126,13 +128,14 @@ class SimulatedDevice(DacDevice):
         self._bend = _S_SHAPE * 2.0 * self._reach_um * 0.01 * options.nonlinearity_percent
         self._output_at_open = options.output_at_open
         self._plant: Plant | None = None
-        self._next_sample = 0
-        self._last_command = 0.0
+        self._next_sample = self._digital_readings = 0
+        self._rate_hz = self._last_command = 0.0
         self._last_reading_um = 0.0
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Put the plant at rest at the present output, with the sample count at 0."""
         del block
+        self._rate_hz, self._digital_readings = sample_rate_hz, 0
         self._plant = self.plant(sample_rate_hz)
         self._next_sample = 0
         self._last_command = self._output_at_open or 0.0
@@ -169,6 +172,14 @@ class SimulatedDevice(DacDevice):
     def _put_out(self, command: float) -> None:
         """Put the output there; an injected fault does not prevent it."""
         self._last_command = command
+
+    def _set_digital(self, high: bool) -> None:
+        """Do nothing: a recording has the pulses."""
+
+    def _read_digital(self) -> bool:
+        """Return whether a second has passed; a period passes per reading."""
+        self._digital_readings += 1
+        return self._digital_readings > self._rate_hz
 
     def _close(self) -> None:
         """There is nothing to disarm."""

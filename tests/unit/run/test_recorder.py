@@ -298,6 +298,7 @@ class RecorderDouble:
 
     def __init__(self):
         self.firsts, self.events, self.finished, self.errors = [], [], None, []
+        self.postponed = []
         self.disk = threading.Event()
         self.disk.set()
         self.broken = self.refused = False
@@ -313,6 +314,9 @@ class RecorderDouble:
 
     def event(self, event):
         self.events.append(event.code)
+
+    def postpone(self, later_ns):
+        self.postponed.append((later_ns, len(self.firsts)))
 
     def note_device(self):
         self.noted = len(self.firsts)
@@ -346,6 +350,19 @@ def exchange(ring, count, *, answered=True):
         ring.sending(block)
         if answered:
             ring.answered(block)
+
+
+def test_a_later_start_is_written_before_the_first_sample(ring, recording):
+    recording._start_ns = 100
+    recording.record_event(Event(0, "info", "mark", "in the wait"))
+    ring.page.put(PageField.START_NS, 100)
+    recording._drain()
+    assert recording.recorder.events == []
+    ring.page.put(PageField.START_NS, 130)
+    exchange(ring, 2)
+    recording._drain()
+    assert recording.recorder.postponed == [(30, 0)]
+    assert len(recording.recorder.events) == 1
 
 
 def test_room_is_given_back_once_the_file_has_what_stood_there(ring, recording):
@@ -434,7 +451,7 @@ def test_whatever_goes_wrong_in_it_is_said_and_the_end_comes_all_the_same(ring, 
     assert recording.recorder.errors == ["ZeroDivisionError: a bug"]
     recording.recorder.broken = False
     recording.end(ENDED, lost_loop=False)
-    recording.start()
+    recording.start(0)
     recording._thread.join(30.0)
     assert recording.finished
     assert recording.recorder.finished == ("waveform completed", 8)
@@ -444,7 +461,7 @@ def test_the_device_is_told_of_the_run_before_all_else(ring, recording):
     """A run that is killed must not leave the device to the one before it."""
     exchange(ring, 2)
     recording.end(ENDED, lost_loop=False)
-    recording.start()
+    recording.start(0)
     recording._thread.join(30.0)
     assert (recording.recorder.noted, recording.recorder.firsts) == (0, [0, 1])
 
@@ -454,7 +471,7 @@ def test_nobody_waits_for_a_disk_that_stands_still(ring, recording, monkeypatch)
     monkeypatch.setattr(recorder.time, "monotonic", lambda: now_s)
     recording.recorder.disk.clear()
     exchange(ring, 2)
-    recording.start()
+    recording.start(0)
     recording.record_event(Event(0, "info", "x", ""))
     recording.end(ENDED, lost_loop=False)
     assert not recording.finished
@@ -466,7 +483,8 @@ def test_nobody_waits_for_a_disk_that_stands_still(ring, recording, monkeypatch)
     assert recording.recorder.finished == ("waveform completed", 8)
 
 
-def test_marks_are_taken_as_long_as_they_will_be_in_the_file(recording):
+def test_marks_are_taken_as_long_as_they_will_be_in_the_file(ring, recording):
+    exchange(ring, 1)
     recording.recorder.error = ""
     assert recording.takes_marks
     for _ in range(64):

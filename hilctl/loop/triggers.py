@@ -1,0 +1,77 @@
+"""Triggers: a digital output at marks of the waveform, and a start by a digital input."""
+
+import math
+from collections.abc import Iterable
+from dataclasses import dataclass
+from typing import Literal, TypeAlias
+
+import numpy as np
+
+from hilctl.base.device import DigitalDevice
+from hilctl.base.samples import LAST_SAMPLE
+from hilctl.base.segments import Segment
+from hilctl.base.types import I64
+
+MarkKind: TypeAlias = Literal["cycle", "segment", "run"]
+Level: TypeAlias = Literal["high", "low"]
+
+SHORTEST_CYCLE = 2
+"""Shortest distance of marks in samples: the output is high for one and low for one."""
+
+
+@dataclass(frozen=True, slots=True)
+class Triggers:
+    """Triggers of a run.
+
+    Attributes:
+        marks: int64[m], samples of the waveform with which the digital output is set, in order.
+        start: Level of the digital input that starts the run; None: the run starts immediately.
+        timeout_s: Longest wait for it.
+    """
+
+    marks: I64
+    start: Level | None = None
+    timeout_s: float = math.inf
+
+
+def marks_of(kind: MarkKind | None, segments: Iterable[Segment]) -> I64:
+    """Return the first samples of the waveform, its segments or their cycles, int64[m]."""
+    starts = [each.start for each in segments]
+    if kind != "cycle":
+        return np.array([] if kind is None else starts[:1] if kind == "run" else starts, np.int64)
+    periodic = [each for each in segments if each.period > 0.0]
+    cycles = [np.arange(each.start, each.stop - 0.5, each.period) for each in periodic]
+    # A cycle begins between two samples as a rule; rounding errors must not add one.
+    return np.ceil(np.concatenate([*cycles, []]) - 1e-6).astype(np.int64)
+
+
+class PulseOutput:
+    """The digital output of a run: high for one tick at each mark, otherwise low.
+
+    Args:
+        marks: int64[m], samples of the run, in order.
+    """
+
+    def __init__(self, device: DigitalDevice, marks: I64) -> None:
+        self._device, self._marks = device, marks
+        self._high = False
+        self._due = self._next(-1)
+
+    def follow(self, sample: int, *, active: bool) -> bool:
+        """Set or reset the output in the tick of a sample; return whether it was set.
+
+        A mark in skipped ticks is due in the next one. Without ``active`` the output is reset.
+        """
+        # Low for at least one tick, also between a delayed mark and the next one.
+        high = active and not self._high and sample >= self._due
+        if high != self._high:
+            self._device.set_digital(high)
+            self._high = high
+        if high:
+            self._due = self._next(sample)
+        return high
+
+    def _next(self, sample: int) -> int:
+        """Return the first mark after a sample."""
+        place = int(np.searchsorted(self._marks, sample, "right"))
+        return int(self._marks[place]) if place < self._marks.size else LAST_SAMPLE
