@@ -124,7 +124,7 @@ class Loop:
         self._before = before = LeadIn(conditioning, ramp_samples)
         self._end = before.waveform_at + self._plan.samples
         if (triggers := self._plan.triggers) is not None:
-            if triggers.start is not None and ramp_samples:
+            if self._plan.waits and ramp_samples:
                 rule = "a run that waits for trigger.start must begin at the safe value"
                 cure = "set it with 'hilctl safe'; nothing has moved"
                 raise InputError(f"{rule}, but the output is at {output:g}: {cure}")
@@ -148,9 +148,8 @@ class Loop:
         elif self._phase is _CONDITIONING:
             self._record_condition()
         try:
-            triggered_ns = self._await_trigger(start_ns)
-            self._start_ns = self._armed(triggered_ns)
-            if triggered_ns > start_ns:
+            self._start_ns = self._armed(self._await_trigger(start_ns))
+            if self._plan.waits:
                 self._host.starts_at(self._start_ns)
             self._pacer.begin(self._start_ns)
             while not self._tick():
@@ -172,7 +171,7 @@ class Loop:
         timeout ends the run with its safe ramp.
         """
         triggers, clock = self._plan.triggers, self._clock
-        if triggers is None or triggers.start is None:
+        if triggers is None or not self._plan.waits:
             return start_ns
         device, name = cast(DigitalDevice, self._device), self._device.info.digital_input
         period_ns = math.ceil(self._plan.block / self._plan.sample_rate_hz * 1e9)

@@ -54,6 +54,11 @@ class LoopPlan:
     keep_all: bool = True
 
     @property
+    def waits(self) -> bool:
+        """Whether the run waits for the digital input before its first tick."""
+        return self.triggers is not None and self.triggers.start is not None
+
+    @property
     def samples(self) -> int:
         """Samples of the waveform."""
         return self.reference.size
@@ -90,7 +95,7 @@ class Host(Protocol):
         ...
 
     def starts_at(self, time_ns: int) -> None:
-        """Note a later time of the first tick, before it: the run has waited for a trigger."""
+        """Note the time of the first tick, before it, of a run that has waited for a trigger."""
         ...
 
     def closing(self) -> None:

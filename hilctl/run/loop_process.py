@@ -71,8 +71,9 @@ class RingHost:
         return ""
 
     def starts_at(self, time_ns: int) -> None:
-        """Write the time of the first tick, which the recorder and watchers read."""
+        """Write the time of the first tick, and the phase that lets watchers read it."""
         self._page.put(PageField.START_NS, time_ns)
+        self._page.publish(PageField.PHASE, Phase.RUNNING)
 
     def closing(self) -> None:
         """Write the phase after the loop, in which the device may take its timeouts."""
@@ -131,7 +132,8 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
     loaded = loaded_of(job)
     config, device, page = loaded.config, loaded.device, ring.page
     host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
-    loop = Loop(plan_of(job, loaded), device, host)
+    plan = plan_of(job, loaded)
+    loop = Loop(plan, device, host)
     # After the warm-up, so that all its memory is locked; before the device is opened, so that a
     # refusal moves nothing.
     steps = prepare(config.realtime)
@@ -158,7 +160,8 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
         device.close()  # without a safe value: nothing has moved, and the output must not jump
         raise
     try:
-        page.publish(PageField.PHASE, Phase.RUNNING)
+        if not plan.waits:  # until it starts, arming and readings are no hang
+            page.publish(PageField.PHASE, Phase.RUNNING)
         before = ProcessUsage.now()
         outcome = loop.run(start_ns)
         page.leave_usage(ProcessUsage.now().since(before))

@@ -276,6 +276,10 @@ class Supervisor:
                 raise
             relief.discard()
             _go(ring.page, start_ns)
+            if (trigger := config.trigger) is not None and trigger.start is not None:
+                name = self._checked.loaded.device.info.digital_input
+                awaited = name, trigger.start, trigger.timeout_s
+                _log.warning("waiting until %s is %s, at most %g s", *awaited)
             self._monitor(started, server)
             ring.page.put(PageField.RECORDED, int(not recorder.error))
             stops = self._stops
