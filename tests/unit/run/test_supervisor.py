@@ -184,7 +184,7 @@ class Neighbours:
         self.ring = ring
         return SimpleNamespace(recorder=recorder, start=self.start, record_event=None)
 
-    def start(self):
+    def start(self, *_):
         assert self.ring.page.get(PageField.GO) == 0
         self.note("recording")
 
