@@ -68,6 +68,7 @@ class Neighbours:
             simulated=False, holds=("tcp:here",), latency_blocks=0, arm_s=0.0, aux=()
         )
         self.config = SimpleNamespace(
+            trigger=None,
             name="stage",
             tick_s=0.01,
             block=5,
