@@ -62,6 +62,7 @@ class DacDevice(ABC):
         self._aux_readers: Sequence[Callable[[], float]] = ()
         self._next_aux = 0
         self._digital_is_low = False
+        self.safe_command = math.nan
         self._info = info
         self._title = title
         self._action = action
@@ -206,7 +207,7 @@ class DacDevice(ABC):
     def make_safe(self, command: float) -> None:
         """Set the output to ``command`` in one attempt and disconnect; the watchdog stays armed.
 
-        After the first write that succeeds, the digital output is set low, in one attempt.
+        After a write of :attr:`safe_command` the digital output is set low, in one attempt.
 
         See :meth:`hilctl.base.device.Device.make_safe`.
 
@@ -221,9 +222,9 @@ class DacDevice(ABC):
         action = f"make safe, {self._output_name}"
         try:
             self._put_out(command)
-            self._reset_digital()
+            self._reset_digital(command)
         except UnconfirmedError as error:
-            self._reset_digital()
+            self._reset_digital(command)
             raise UnconfirmedError(str(self._error(action, str(error)))) from None
         except DeviceError as error:
             raise self._error(action, str(error)) from None
@@ -257,9 +258,9 @@ class DacDevice(ABC):
         self.aux[k] = self._aux_readers[k]()
         self._next_aux = (k + 1) % len(self._aux_readers)
 
-    def _reset_digital(self) -> None:
-        """Set the digital output low unless it is; once, because the safe ramp waits for it."""
-        if self._info.digital_output and not self._digital_is_low:
+    def _reset_digital(self, command: float) -> None:
+        """Set the digital output low after the safe command; once, since the outcome waits."""
+        if command == self.safe_command and not self._digital_is_low:
             self._digital_is_low = True
             with suppress(DeviceError):
                 self._set_digital(high=False)

@@ -321,9 +321,14 @@ class ReadableDevice(Protocol):
 class DigitalDevice(Protocol):
     """A device with digital channels for triggers.
 
-    Opening it sets the output low. :meth:`Device.make_safe` sets it low after a write of the safe
-    value or its ramp, in one attempt whose failure is ignored.
+    Opening it sets the output low.
+
+    Attributes:
+        safe_command: The safe value. After a write of it, :meth:`Device.make_safe` also sets the
+            output low, in one attempt whose failure is ignored. NaN: unknown.
     """
+
+    safe_command: float
 
     def set_digital(self, high: bool) -> None:
         """Set the digital output, and await the answer; raise DeviceError as an exchange does."""

@@ -8,9 +8,9 @@ import errno
 import time
 from collections.abc import Callable
 from dataclasses import dataclass
-from typing import Literal, TypeAlias
+from typing import Literal, TypeAlias, cast
 
-from hilctl.base.device import Device
+from hilctl.base.device import Device, DigitalDevice
 from hilctl.base.errors import DeviceError, UnconfirmedError
 
 OutputState: TypeAlias = Literal["confirmed", "set", "sent", "unknown"]
@@ -122,6 +122,9 @@ class SafeOutput:
         on_write: Callable[[float], None] = lambda value: None,
     ) -> None:
         self._device, self._goal = device, goal
+        if device.info.digital_output:
+            # Not with its first write, because the safe ramp must not wait for it.
+            cast(DigitalDevice, device).safe_command = goal.value
         self._clock, self._on_write = clock, on_write
         self._pending = goal.pending
         self._began_s: float | None = None

@@ -15,6 +15,7 @@ from hilctl.loop.safe_output import (
     describe,
     drive_to_safe,
 )
+from tests.fakes import FakeInfo
 
 
 class Amplifier:
@@ -23,6 +24,7 @@ class Amplifier:
     def __init__(self, output=4.0, takes_s=0.0, older=None):
         self.now_s, self.output, self.takes_s, self.older = 100.0, output, takes_s, older
         self.writes, self.error, self.down_until_s = [], None, 0.0
+        self.info = FakeInfo()
 
     def make_safe(self, value):
         self.sleep(self.takes_s)

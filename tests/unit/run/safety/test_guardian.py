@@ -35,6 +35,7 @@ from hilctl.run.shared.shared_page import (
     SafeActionResult,
     SharedPage,
 )
+from tests.fakes import FakeInfo
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(600)"]
 DESCRIPTORS = Path("/proc/self/fd")
@@ -47,8 +48,8 @@ JOB_LIMITS = SilenceLimits(1.0, 1.0, 1.0, 1.0)
 def job_of(experiment, *, ring="", limits=JOB_LIMITS):
     return Job(
         experiment=experiment, files={}, folder="", ring=ring, reference="", input_um="",
-        state=None, heat_a2=0.0, stands_um=None, adapted=None, safe_value=0.25, ramp_per_s=50.0,
-        limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
+        state=None, heat_a2=0.0, stands_um=None, segments=[], adapted=None, safe_value=0.25,
+        ramp_per_s=50.0, limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
     )  # fmt: skip
 
 
@@ -58,7 +59,7 @@ class Device:
     def __init__(self, loop, error=None):
         self.loop, self.error, self.asked = loop, error, []
 
-    info = SimpleNamespace(simulated=False)
+    info = FakeInfo()
 
     def make_safe(self, value):
         with suppress(subprocess.TimeoutExpired):  # one that was killed may still be dying
@@ -452,7 +453,7 @@ def act(tmp_path):
     page = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1).page
 
     def start(make_safe, **changes):
-        device = SimpleNamespace(make_safe=make_safe)
+        device = SimpleNamespace(info=FakeInfo(), make_safe=make_safe)
         action = SafeAction(page, device, GOAL, **{"hung": False, **changes})
         action.page = page
         return action

@@ -12,6 +12,7 @@ from hilctl.run.safety.guardian import LAST_CALL_MS
 from hilctl.run.safety.safety_monitor import SafetyMonitor
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, Phase, SafeActionResult
+from tests.fakes import FakeInfo
 
 MS = 1_000_000
 
@@ -43,9 +44,7 @@ class Run:
         self.page, self.log, self.events, self.guardians = page, [], [], []
         self.now_ns, self.fail_start, self.error = 10**9, None, None
         self.watched = []
-        device = SimpleNamespace(
-            info=SimpleNamespace(simulated=simulated), make_safe=self.make_safe
-        )
+        device = SimpleNamespace(info=FakeInfo(simulated=simulated), make_safe=self.make_safe)
         timing = SimpleNamespace(hang_s=None, max_late_s=1.0)
         config = SimpleNamespace(
             timing=timing,
