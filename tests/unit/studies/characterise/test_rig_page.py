@@ -77,7 +77,7 @@ def test_the_held_out_error_comes_first():
 def test_the_problem_is_at_the_top(tmp_path):
     stopped = replace(
         FOUND, held_out=(), problem="no <reaction>: look", measured=replace(FOUND.measured,
-            growing=(), reversal=None
+            small=None, growing=(), reversal=None
         ),
         steps=(StepRow("rest", "noise & drift", 2.0, 0.1, "0.03 um", "/x/01-rest.mcap"),),
     )  # fmt: skip
