@@ -287,22 +287,26 @@ class AsciiOutput(ScaledRange):
     @model_validator(mode="after")
     def _has_value(self) -> Self:
         self.check_write("write", self.write)
-        for limit in self.limits:
-            try:
-                fill(self.write, **SAMPLES | {"value": self.number(limit)})
-            except BadRequestError as error:
-                value = f"{limit:g} {self.unit} with scale {self.scale:g}"
-                raise ValueError(f"min and max must fit write, got {value}: {error}") from None
         return self
 
     def check_write(self, key: str, template: str) -> None:
-        """Raise ValueError if a template has no value, or rounds it by more than a step.
+        """Raise ValueError if a template has no value, or breaks a rule of :meth:`check_field`."""
+        if "value" not in fields_of(template):
+            raise ValueError(f"{key} must have the field {{value}}")
+        self.check_field(key, template, "value")
+
+    def check_field(self, key: str, template: str, field: str) -> None:
+        """Raise ValueError if a field of a template overflows, or rounds by more than a step.
 
         The text is made after the limiter: a coarse format would exceed the limits of a run.
         """
-        specs = [spec or "" for _, name, spec, _ in Formatter().parse(template) if name == "value"]
-        if not specs:
-            raise ValueError(f"{key} must have the field {{value}}")
+        for limit in self.limits:
+            try:
+                fill(template, **SAMPLES | {field: self.number(limit)})
+            except BadRequestError as error:
+                value = f"{limit:g} {self.unit} with scale {self.scale:g}"
+                raise ValueError(f"{key} must hold min and max, got {value}: {error}") from None
+        specs = [spec or "" for _, name, spec, _ in Formatter().parse(template) if name == field]
         for spec in specs:
             for part in range(8) if binary_format(spec) is None else ():
                 # Sevenths have no short decimal.
@@ -316,7 +320,7 @@ class AsciiOutput(ScaledRange):
                     rule = f"{key} must have the digits of {self.step:g} {self.unit}"
                     why = "the resolution, or a thousandth of the range"
                     places = max(0, math.ceil(-math.log10(self.step / abs(self.scale))))
-                    hint = f"use for example {{value:.{places}f}}"
+                    hint = f"use for example {{{field}:.{places}f}}"
                     raise ValueError(f"{rule} ({why}), got {sent!r} for {number:g}: {hint}")
 
 
@@ -514,6 +518,15 @@ class AsciiProfile(BaseProfile):
                 "exchange.write must be one line if min_gap_s separates commands, got "
                 f"{self.exchange.write!r}"
             )
+        return self
+
+    @model_validator(mode="after")
+    def _safe_value_fits(self) -> Self:
+        steps = {} if self.watchdog == "none" else self.watchdog.model_dump()
+        for key, text in _texts(steps, _REQUESTS):
+            for name, output in self.outputs.items():
+                if not key.startswith("safe.") or key.startswith(f"safe.{name}."):
+                    output.check_field(f"watchdog.{key}", text, "safe")
         return self
 
     @model_validator(mode="after")
