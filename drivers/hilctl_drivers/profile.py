@@ -95,6 +95,11 @@ def parse_profile(text: str, where: str) -> BaseProfile:
         rule = f"must be one of {', '.join(LINK_KINDS)}"
         value = "nothing" if kind is None else repr(kind)
         raise ConfigError([document.problem("link.kind", rule, value)])
+    unknown = document.data.keys() - profile_class(kind).model_fields
+    others = [other for other in LINK_KINDS if unknown and _has_keys(document, other)]
+    if others:
+        rule = f"must be one of {', '.join(others)} with the key {min(unknown)}"
+        raise ConfigError([document.problem("link.kind", rule, repr(kind))])
     profile = document.validate(profile_class(kind))
     problems = [
         ConfigProblem(
@@ -110,6 +115,12 @@ def parse_profile(text: str, where: str) -> BaseProfile:
     if problems:
         raise ConfigError(problems)
     return profile
+
+
+def _has_keys(document: Document, kind: str) -> bool:
+    """Return whether a file has at the top the keys of profiles of a kind."""
+    fields, keys = profile_class(kind).model_fields, document.data.keys()
+    return fields.keys() >= keys >= {name for name, each in fields.items() if each.is_required()}
 
 
 def with_link(profile: _Profile, **changes: Any) -> _Profile:

@@ -101,6 +101,7 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"inputs": {}, "exchange": 23}, "exchange must be none if there are no outputs"),
     ("modbus", {"outputs": {}, "watchdog": WATCHDOG}, "watchdog must be none if there are no"),
     ("modbus", {"link.kind": "udp"}, f"{KINDS}, got"),
+    ("modbus", {"link.kind": "ascii"}, "link.kind: must be one of rtu, rtu_tcp, tcp with the key"),
     ("modbus", {"watchdog": False},
      "watchdog: must be a mapping of keys to values, or 'none', got false"),
     ("modbus", {AO + "address": 65536}, "outputs.AO.address must be in area holding"),
