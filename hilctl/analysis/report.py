@@ -9,7 +9,7 @@ import numpy as np
 from pydantic import TypeAdapter, ValidationError
 
 from hilctl.analysis import tick_lateness
-from hilctl.analysis.run_metrics import RunReport, SegmentReport
+from hilctl.analysis.run_metrics import AuxReport, RunReport, SegmentReport
 from hilctl.analysis.steady_state import judged, loop_signals, trusted
 from hilctl.analysis.tick_lateness import Quantiles
 from hilctl.base.errors import DataError
@@ -108,6 +108,7 @@ class RunReportBuilder:
         self._waveform: tuple[int, int] | None = None
         self._command, self._displacement_um = _Extremes(), _Extremes()
         self._age_s = _Extremes()
+        self._aux = [_Extremes() for _ in first.aux_channels]
 
     @np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
     def add(self, piece: Recording) -> None:
@@ -136,6 +137,8 @@ class RunReportBuilder:
         self._command.add(samples.command)
         self._displacement_um.add(samples.displacement_um)
         self._age_s.add(samples.reading_age_s)
+        for found, values in zip(self._aux, samples.aux.T, strict=True):
+            found.add(values)
 
     def right_windows(self) -> Windows:
         """Return the windows by the progress and tuning of the run, after the last piece."""
@@ -184,6 +187,12 @@ class RunReportBuilder:
             "displacement_min_um": self._displacement_um.low,
             "displacement_max_um": self._displacement_um.high,
             "reading_age_max_s": self._age_s.high,
+            "aux": {
+                channel.name: AuxReport(
+                    channel.unit, channel.meaning, each.mean, each.low, each.high
+                )
+                for channel, each in zip(self._last.aux_channels, self._aux, strict=True)
+            },
         }
 
     def _timing(self) -> dict[str, Any]:
@@ -200,11 +209,16 @@ class RunReportBuilder:
 
 
 class _Extremes:
-    """Lowest and highest finite value; None if there is none."""
+    """Mean, lowest and highest of finite values; None if there is none."""
 
     def __init__(self) -> None:
         self.low: float | None = None
         self.high: float | None = None
+        self._sum, self._count = 0.0, 0
+
+    @property
+    def mean(self) -> float | None:
+        return self._sum / self._count if self._count else None
 
     def add(self, column: F64) -> None:
         finite = np.isfinite(column)
@@ -213,6 +227,8 @@ class _Extremes:
             low, high = float(known.min()), float(known.max())
             self.low = low if self.low is None else min(self.low, low)
             self.high = high if self.high is None else max(self.high, high)
+            self._sum += float(known.sum())
+            self._count += known.size
 
 
 def _identity(recording: Recording) -> dict[str, Any]:

@@ -65,6 +65,17 @@ class SegmentReport(RunMetrics):
     samples: int
 
 
+@dataclass(frozen=True, slots=True)
+class AuxReport:
+    """An auxiliary channel over all recorded samples; None without a reading."""
+
+    unit: str
+    meaning: str
+    mean: float | None
+    min: float | None
+    max: float | None
+
+
 @shown_briefly
 @dataclass(frozen=True, slots=True)
 class RunReport(RunMetrics):
@@ -92,6 +103,7 @@ class RunReport(RunMetrics):
         reading_age_max_s: Largest age of a reading; None unless the sensor sends unasked.
         lost_readings: Readings of such a sensor that did not arrive.
         zero_um: Zero of the sensor, subtracted from its readings; None without one.
+        aux: Auxiliary channels by name.
         late_ticks: Late ticks; None if not recorded.
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of the lateness of ticks;
             empty without ticks.
@@ -131,6 +143,7 @@ class RunReport(RunMetrics):
     reading_age_max_s: float | None
     lost_readings: int
     zero_um: float | None
+    aux: Mapping[str, AuxReport]
     late_ticks: int | None
     lateness_us: dict[str, float]
     lateness_by_minute: list[dict[str, float]]
@@ -171,6 +184,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("loop", f"displacement against {loop_input}"),
         ("command", _range(report.command_min, report.command_max, report.command_unit)),
         ("displacement", _range(report.displacement_min_um, report.displacement_max_um, "um")),
+        *((name, _aux(each)) for name, each in report.aux.items()),
         ("limited samples", f"{report.limited_samples:,}"),
         ("invalid readings", f"{report.sensor_invalid_samples:,}"),
         *([("sensor zero", _zero(report))] if report.zero_um is not None else []),
@@ -183,6 +197,12 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("exchange", _percentiles(report.exchange_us)),
         *((f"{name} process", usage_text(each)) for name, each in report.processes.items()),
     ]
+
+
+def _aux(found: AuxReport) -> str:
+    mean = f", mean {number(found.mean, found.unit)}" if found.mean is not None else ""
+    meaning = f" ({found.meaning})" if found.meaning else ""
+    return printable(f"{_range(found.min, found.max, found.unit)}{mean}{meaning}")
 
 
 def _zero(report: RunReport) -> str:

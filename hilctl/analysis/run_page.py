@@ -196,11 +196,6 @@ def _rows(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "waveform", f"{segments[0].label}{more}" if segments else ""
     yield "waveform settings", _settings(recording)
     yield "limits", _listed(run.get("limits", ""))
-    for each in recording.aux_channels:
-        values = recording.aux[each.name]
-        ends = (part.reduce(values, initial=np.nan) for part in (np.fmin, np.fmax))
-        text = " to ".join(significant(float(end)) for end in ends)
-        yield each.name, f"{text} {each.unit}" + f" ({each.meaning})" * bool(each.meaning)
     yield "overrides", _listed(run.get(OVERRIDES_FACT, ""))
     yield from _model(recording)
 

@@ -11,6 +11,7 @@ import pytest
 
 from hilctl.analysis.report import processes_of, summarize, worst_segment
 from hilctl.analysis.run_metrics import RunReport, run_rows
+from hilctl.base.device import AuxChannel
 from hilctl.base.errors import DataError
 from hilctl.base.events import ADAPTED, LOST_READINGS, MARK, TUNED, ZERO, Event
 from hilctl.base.samples import Flag
@@ -139,6 +140,21 @@ class TestSteadyPeriodicRun:
         report = summarize(replace(recording, samples=samples, events=(event,)))
         assert (report.reading_age_max_s, report.lost_readings) == (0.02, 7)
         assert "reading age" in dict(run_rows(report))
+
+    def test_auxiliary_channels(self, lagging) -> None:
+        recording = lagging()
+        coil_c = np.linspace(20.0, 30.0, recording.samples.index.size)
+        aux = np.column_stack((np.append(np.nan, coil_c[1:]), np.full(coil_c.size, np.nan)))
+        channels = AuxChannel("coil_c", "degC", "coil"), AuxChannel("preload_n", "N")
+        samples = replace(recording.samples, aux=aux)
+        report = summarize(replace(recording, samples=samples, aux_channels=channels))
+        found = report.to_mapping()["aux"]
+        assert found["coil_c"] == {
+            "unit": "degC", "meaning": "coil", "mean": pytest.approx(25.0, abs=0.01),
+            "min": coil_c[1], "max": 30.0,
+        }  # fmt: skip
+        assert found["preload_n"]["mean"] is found["preload_n"]["max"] is None
+        assert dict(run_rows(report)).keys() >= {"coil_c", "preload_n"}
 
     def test_zero_of_the_sensor(self, lagging) -> None:
         assert summarize(lagging()).zero_um is None
