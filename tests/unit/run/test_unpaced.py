@@ -7,9 +7,10 @@ from types import SimpleNamespace
 
 import numpy as np
 import pytest
+from pyarrow import parquet
 
 from hilctl.analysis.catalogue import read_catalogue, select
-from hilctl.analysis.export import columns
+from hilctl.analysis.export import columns, export_all
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
@@ -81,6 +82,17 @@ def test_an_auxiliary_channel_ends_a_run(tmp_path, settings, value):
     highest = select(read_catalogue(tmp_path), "aux.rod_c.max < aux.coil_c.max")[0]["options"]
     assert highest["aux.coil_c.max"] == np.nanmax(recording.aux["coil_c"])
     assert [*columns(recording)][-3:] == ["coil_c", "rod_c", "flags"]
+
+
+def test_all_exported_files_have_the_auxiliary_channels_of_all_runs(tmp_path):
+    for name, settings in (("plain", []), ("warm", ["device.temperatures={coil_tau_s: 0.2}"])):
+        run_unpaced(checked_experiment(UNCOMPENSATED, SHORT + settings), tmp_path / f"{name}.mcap")
+    assert export_all(tmp_path, tmp_path / "out", lambda part, path: None).written == 2
+    for name, channels in (("plain", set()), ("warm", {"coil_c", "rod_c"})):
+        (path,) = (tmp_path / "out").rglob(f"{name}-*.parquet")
+        table = parquet.ParquetFile(path).read()
+        aux = table.select(["coil_c", "rod_c"])
+        assert {each for each in aux.column_names if not aux[each].null_count} == channels
 
 
 @pytest.mark.parametrize("latency", [0, 3])
