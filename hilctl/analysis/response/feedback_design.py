@@ -4,6 +4,7 @@ The response is from the compensator's input to the displacement. It may be meas
 because the periods of a multisine average what the feedback makes of noise and drift.
 """
 
+import math
 from collections.abc import Mapping
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -33,7 +34,7 @@ from hilctl.experiment.open_loop import (
     LoopResponse,
     MeasuredResponse,
 )
-from hilctl.loop.feedback import Gains
+from hilctl.loop.feedback import MOST_GAIN_PER_BLOCK, Gains
 from hilctl.models.model_file import model_sha256, parse_model
 from hilctl.recording.recording import Recording
 
@@ -117,7 +118,9 @@ def design_feedback(recording: Recording, response_file: str | None = None) -> F
     kind = "pi" if config.block == 1 and not latency else "integral"
     try:
         loop = response.open_loop(Gains(0.0, 1.0), exchange)
-        highest_hz = bandwidth_of(kind, loop.room(ASSUMED_PHASE_MARGIN_DEG), exchange.rate_hz)
+        most = MOST_GAIN_PER_BLOCK / config.tick_s if kind == "integral" else math.inf
+        ki_per_s = min(loop.room(ASSUMED_PHASE_MARGIN_DEG), most)
+        highest_hz = bandwidth_of(kind, ki_per_s, exchange.rate_hz)
         keys = {**_kept(config), "kind": kind, "bandwidth_hz": rounded_down(highest_hz)}
         make = IntegralFeedbackConfig if kind == "integral" else PiFeedbackConfig
         keys |= {"response": response_file} if response_file else {}

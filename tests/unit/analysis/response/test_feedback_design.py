@@ -9,6 +9,7 @@ from hilctl.analysis.response.feedback_design import design_feedback, write_desi
 from hilctl.base.errors import HilctlError
 from hilctl.base.segments import Segment
 from hilctl.base.yaml import Document, dump
+from hilctl.loop.feedback import MOST_GAIN_PER_BLOCK
 from tests.unit.experiment.test_closed_loop import MODEL, PLAIN
 from tests.unit.loop.test_feedback import EXPERIMENT
 
@@ -57,6 +58,13 @@ def test_blocks_and_a_fifo_get_the_integral_controller(measured, block, latency)
     assert found.feedback["kind"] == "integral"
     wait = (1 + latency) * block + 0.5  # samples
     assert found.feedback["bandwidth_hz"] == pytest.approx(RATE_HZ / 12.0 / wait, rel=0.03)
+
+
+def test_the_gain_per_block_is_one_that_a_run_accepts(measured):
+    """The margins alone allow a larger one if the displacement is a third of the reference."""
+    found = design_feedback(measured(PLAIN, "block=20", sign=0.3))
+    gain_per_block = 2.0 * np.pi * found.feedback["bandwidth_hz"] * 20 / RATE_HZ
+    assert 0.99 < gain_per_block < MOST_GAIN_PER_BLOCK
 
 
 def test_recorded_feedback_is_evaluated_and_its_other_keys_are_kept(measured):
