@@ -282,7 +282,7 @@ def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, byp
         command_min=float(np.min(commands)),  # keeps a NaN, where min() would not
         command_max=float(np.max(commands)),
         slew_per_s=0.0,
-        voltage_v=None,
+        voltage_v=_voltage_v(checked, min(commands), max(commands)),
         budget_used_s=None,
     )
     problems += command_problems(checked.loaded, bound)
@@ -297,17 +297,35 @@ def command_range(
     They are those of a sine over this range, plus the difference between the checked run and a sine
     over the run's range, which is due to rate and history, times the gain.
     """
-    found = _sine_commands(checked, low, high)
-    line = checked.forecast.line
-    if line is None:  # no model: the commands are the reference; or a constant reference
-        return found
-    # The ends of the line are the lowest and highest command of the checked waveform.
-    known = sorted(line.slope * end + line.at_zero for end in checked.reference.span)
+    found, known = _sine_commands(checked, low, high), _checked_range(checked)
     sine = _sine_commands(checked, *checked.reference.span)
     more = [gain * (known[end] - sine[end]) for end in (0, 1)]
     if gain < 0.0:
         more.reverse()
     return found[0] + more[0], found[1] + more[1]
+
+
+def _checked_range(checked: CheckedExperiment) -> tuple[float, float]:
+    """Return the lowest and highest command of the checked waveform."""
+    line, span = checked.forecast.line, checked.reference.span
+    if line is None:  # no model: the commands are the reference; or a constant reference
+        return _sine_commands(checked, *span)
+    ends = [line.slope * end + line.at_zero for end in span]
+    return min(ends), max(ends)
+
+
+def _voltage_v(checked: CheckedExperiment, low: float, high: float) -> float | None:
+    """Return the amplifier's voltage for commands from ``low`` to ``high``; None if unknown.
+
+    The part of the checked voltage that the resistance does not explain grows with the range.
+    """
+    amplifier, forecast = checked.loaded.config.amplifier, checked.forecast
+    if amplifier is None or forecast.voltage_v is None or forecast.voltage_at_s < forecast.before_s:
+        return None
+    before = _checked_range(checked)
+    held_v = amplifier.resistance_ohm * max(abs(low), abs(high))
+    more_v = forecast.voltage_v - amplifier.resistance_ohm * max(map(abs, before))
+    return held_v + more_v * (high - low) / max(before[1] - before[0], 1e-300)
 
 
 def _sine_commands(checked: CheckedExperiment, low: float, high: float) -> tuple[float, float]:

@@ -169,12 +169,15 @@ RDPI = terfenol_rdpi()
 LOOKING_AHEAD = StagedModel.around(RDPI, lag=FieldLag(tau_s=2e-3))
 
 
-def experiment_of(model=None, amplitude=4.0, offset=0.0, hz=10.0, peak_a=7.0, limits=""):
+def experiment_of(
+    model=None, amplitude=4.0, offset=0.0, hz=10.0, peak_a=7.0, limits="", amplifier="null"
+):
     text = TEXT.replace("WAVEFORM", SINE).replace("UNIT", "A" if model is None else "um")
     for name, value in {"AMPLITUDE": amplitude, "OFFSET": offset, "HZ": hz, "PEAK": peak_a}.items():
         text = text.replace(name, str(value))
     text = text.replace("COMPENSATOR", "none" if model is None else f"{{model: {MODEL}}}")
-    text = text.replace("stroke_um", limits + "stroke_um") + f"block: {BLOCK}\n"
+    text = text.replace("stroke_um", limits + "stroke_um")
+    text += f"block: {BLOCK}\namplifier: {amplifier}\n"
     loaded = resolve(Document("x.yaml", text), Path())
     info = replace(DESCRIBED, buffered=True, fifo_depth=1000)
     return check(replace(loaded, device=DescribedDevice(info), model=model))
@@ -347,6 +350,21 @@ def test_an_inverse_that_is_not_there_can_not_go_out(page):
 def test_without_a_model_the_bound_is_exact(gain, offset, refused):
     made = experiment_of(peak_a=5.0)
     assert bool(bound_refusal(made, gain, offset, bypassed=False)) == refused
+
+
+@pytest.mark.parametrize(("gain", "offset", "refused"), [
+    (1.0, 0.0, False),
+    (-1.2, 0.0, False),
+    (-1.22, 0.0, True),
+    (1.0, 1.5, False),
+    (1.0, -1.6, True),
+    (0.0, 6.0, False),
+])  # fmt: skip
+def test_the_voltage_is_bounded_too(gain, offset, refused):
+    """4 A of 100 Hz need 29.8 V: 4 ohm and 6.28 ohm of the inductance."""
+    amplifier = "{voltage_max_v: 36, resistance_ohm: 4, inductance_h: 0.01}"
+    made = experiment_of(hz=100.0, amplifier=amplifier)
+    assert ("V" in bound_refusal(made, gain, offset, bypassed=False)) == refused
 
 
 def test_the_straight_line_is_bounded_while_it_gives_commands():
