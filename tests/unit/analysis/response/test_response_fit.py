@@ -33,3 +33,12 @@ def test_as_many_modes_as_there_are(response, natural_hz, further):
     assert len(found["further"]) == further
     for mode in found["further"]:
         assert mode.model_dump() == pytest.approx(MODE.model_dump(), rel=0.01)
+
+
+def test_no_mode_beyond_the_lines():
+    """A mode that is added may move an earlier one there."""
+    hz = np.arange(20.0, 201.0, 20.0)
+    response = np.exp(-2j * np.pi * hz * 1.5e-3 - 0.1j) / (1.0 + 2j * np.pi * hz * 3e-3)
+    response /= second_order(hz, 300.0, 0.02)
+    found = fitted_fields(hz, response, np.full(hz.size, 1e-4), 1000.0, held=False)
+    assert found["natural_hz"] is None or found["natural_hz"] < hz[-1]
