@@ -28,7 +28,7 @@ from hilctl.cli.console import compile_progress, console, listing, progress_bar,
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.device_rules import interlock_context
-from hilctl.experiment.file import Trigger, label_settings
+from hilctl.experiment.file import label_settings
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.live.server_process import served_beside
 from hilctl.loop.safe_output import describe
@@ -148,6 +148,7 @@ def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
     forecast = {
         "warnings": list(checked.warnings),
         "expected_error": asdict(checked.expected) if checked.expected else None,
+        "trigger": _trigger(checked),
         **checked.forecast.to_mapping(),
     }
     values = {"experiment": str(experiment), **forecast}
@@ -302,8 +303,8 @@ def print_forecast(checked: CheckedExperiment) -> None:
         )
     if aux := interlock_context(config, info).aux:
         rows["auxiliary"] = "; ".join(f"{each.channel.name}: {each}" for each in aux)
-    if config.trigger is not None:
-        rows["trigger"] = _trigger(config.trigger, checked)
+    if (trigger := _trigger(checked)) is not None:
+        rows["trigger"] = _trigger_text(trigger, config.tick_s)
     if info.safe_note:
         rows["safe value"] = info.safe_note
     if forecast.heating_rms_a is not None:
@@ -317,20 +318,29 @@ def print_forecast(checked: CheckedExperiment) -> None:
     terminal.print("ready to run", style="green")
 
 
-def _trigger(trigger: Trigger, checked: CheckedExperiment) -> str:
-    """Return start, marks and cost of the triggers in words."""
-    info, config, parts = checked.loaded.device.info, checked.loaded.config, []
-    if trigger.start is not None:
-        parts.append(
-            f"starts with {info.digital_input} {trigger.start}, at most {trigger.timeout_s:g} s"
-        )
-    if trigger.output is not None:
-        marks = trigger.of(checked.reference.segments).marks.size
-        pulse = f"{info.digital_output} is high for one sample at each {trigger.output} ({marks})"
-        if info.digital_output_s:
-            pulse += f", in {1e3 * info.digital_output_s:.2g} of {1e3 * config.tick_s:.3g} ms"
-        parts.append(pulse)
-    return "; ".join(parts)
+def _trigger(checked: CheckedExperiment) -> dict[str, Any] | None:
+    """Return the keys of the triggers with channels, number of marks and cost; None without."""
+    trigger, info = checked.loaded.config.trigger, checked.loaded.device.info
+    if trigger is None:
+        return None
+    return {
+        **trigger.model_dump(),
+        "digital_output": info.digital_output,
+        "digital_output_s": info.digital_output_s,
+        "digital_input": info.digital_input,
+        "marks": trigger.of(checked.reference.segments).marks.size,
+    }
+
+
+def _trigger_text(known: dict[str, Any], tick_s: float) -> str:
+    parts = []
+    if known["start"]:
+        parts.append("starts with {digital_input} {start}, at most {timeout_s:g} s")
+    if known["output"]:
+        parts.append("{digital_output} is high for one sample at each {output} ({marks})")
+        if cost_s := known["digital_output_s"]:
+            parts[-1] += f", in {1e3 * cost_s:.2g} of {1e3 * tick_s:.3g} ms"
+    return "; ".join(parts).format(**known)
 
 
 def _recording(megabytes: float) -> str:

@@ -143,9 +143,7 @@ class RunReader:
             return outcome.code
         if self.ended:
             return "ended"
-        if self._page.get(PageField.STOP):
-            return "stopping"
-        return Phase(self._page.get(PageField.PHASE)).name.lower()
+        return self._page.state()
 
     @property
     def inverse(self) -> str | None:

@@ -17,6 +17,7 @@ Level: TypeAlias = Literal["high", "low"]
 
 SHORTEST_CYCLE = 2
 """Shortest distance of marks in samples: the output is high for one and low for one."""
+_ROUNDING = 1e-6  # of a sample: must not add a cycle, or delay one
 
 
 @dataclass(frozen=True, slots=True)
@@ -40,9 +41,10 @@ def marks_of(kind: MarkKind | None, segments: Iterable[Segment]) -> I64:
     if kind != "cycle":
         return np.array([] if kind is None else starts[:1] if kind == "run" else starts, np.int64)
     periodic = [each for each in segments if each.period > 0.0]
-    cycles = [np.arange(each.start, each.stop - 0.5, each.period) for each in periodic]
-    # A cycle begins between two samples as a rule; rounding errors must not add one.
-    return np.ceil(np.concatenate([*cycles, []]) - 1e-6).astype(np.int64)
+    # A cycle begins between two samples as a rule, and needs a sample of its segment.
+    ends = [each.stop - 1 + _ROUNDING for each in periodic]
+    cycles = [np.arange(e.start, end, e.period) for e, end in zip(periodic, ends, strict=True)]
+    return np.ceil(np.concatenate([*cycles, []]) - _ROUNDING).astype(np.int64)
 
 
 class PulseOutput:

@@ -136,6 +136,12 @@ def test_pulses_are_at_the_recorded_marks(bench):
     assert bench.pulses == (marks.tolist(), (marks + 1).tolist())
 
 
+def test_without_channels_nothing_digital_is_written(bench):
+    device = bench.make(digital_output=None, digital_input=None)
+    assert bench.run(5, device=device).code == "completed"
+    assert not any(isinstance(each, bool) for each in bench.events)
+
+
 def test_the_input_starts_the_run(bench):
     assert bench.run(5, start="high", timeout_s=5.0).code == "completed"
     event = next(each for each in bench.host.events if each.code == TRIGGERED)

@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from pydantic import TypeAdapter
 
 from hilctl.base.segments import Segment
+from hilctl.loop.triggers import marks_of
 from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform
 
@@ -178,6 +179,20 @@ def test_soft_ends_are_zero(w):
     hard = made({**w, "soft_start_s": 0.0, "soft_end_s": 0.0}).values
     steady = slice(segment.steady_start, segment.steady_stop)
     np.testing.assert_array_equal(reference.values[steady], hard[steady])
+
+
+@given(st.lists(sine_like("sine"), min_size=1, max_size=3), st.floats(1000.0, 5000.0))
+def test_marks_of_cycles_are_less_than_a_sample_late(parts, rate_hz):
+    sequence = {"kind": "sequence", "unit": "um", "parts": tuple(parts)}
+    segments = build(ADAPTER.validate_python(sequence), rate_hz, Path()).segments
+    marks = marks_of("cycle", segments)
+    for part, each in zip(parts, segments, strict=True):
+        own = marks[(each.start <= marks) & (marks < each.stop)]
+        period = rate_hz / part["frequency_hz"]
+        late = own - each.start - period * np.arange(own.size)
+        assert -1e-5 < late.min() <= late.max() < 1.0
+        assert each.start + own.size * period > each.stop - 1  # none is missing
+    assert marks.max() < segments[-1].stop
 
 
 @given(st.lists(singles, min_size=1, max_size=4), st.integers(1, 3))

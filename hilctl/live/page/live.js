@@ -212,7 +212,7 @@ function showGauges() {
 }
 
 function showControls() {
-  const runs = status.state === "running";
+  const runs = ["running", "waiting"].includes(status.state);
   for (const field of ["gain", "offset"]) {
     const input = $(field);
     if (document.activeElement !== input && !input.dataset.touched) input.value = status[field];

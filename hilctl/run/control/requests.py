@@ -41,7 +41,7 @@ from hilctl.run.control.client import (
 )
 from hilctl.run.recorder import RingRecorder
 from hilctl.run.run_folder import RunFolder, facts_of
-from hilctl.run.shared.shared_page import PageField, Phase, SharedPage
+from hilctl.run.shared.shared_page import PageField, SharedPage
 
 _log = logging.getLogger(__name__)
 
@@ -413,10 +413,9 @@ class Requests:
 
     def _status(self) -> dict[str, Any]:
         page, config = self._page, self._checked.loaded.config
-        phase = Phase(page.get(PageField.PHASE)).name.lower()
         return {
             **facts_of(self._folder),
-            "state": "stopping" if page.get(PageField.STOP) else phase,
+            "state": page.state(),
             "sample": page.get(PageField.NEXT_SAMPLE),
             "total_samples": self._checked.forecast.samples,
             "sample_rate_hz": config.sample_rate_hz,

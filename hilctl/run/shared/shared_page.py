@@ -261,6 +261,13 @@ class SharedPage:
         # After the text, which the phase announces.
         self.publish(PageField.PHASE, Phase.ENDED)
 
+    def state(self) -> str:
+        """Return the state of the run in one word: ``waiting`` is that for its trigger."""
+        if self.get(PageField.STOP):
+            return "stopping"
+        phase = Phase(self.get(PageField.PHASE))
+        return "waiting" if phase is Phase.READY and self.get(PageField.GO) else phase.name.lower()
+
     def outcome(self) -> LoopOutcome | None:
         """Return the outcome that the loop wrote, or None."""
         if self.observe(PageField.PHASE) != Phase.ENDED:

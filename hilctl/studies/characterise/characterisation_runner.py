@@ -42,11 +42,14 @@ from hilctl.studies.step_runner import (
 
 
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
-    """Return settings with a hold as waveform, without a compensator and all that needs one."""
+    """Return settings with a hold as waveform, without what belongs to the experiment's own one.
+
+    That is the compensator, all that needs one, and the trigger.
+    """
     document = document_with(experiment, settings)
     unit = "V" if document.holds(("limits", "drive_v")) else "A"
     hold = {"kind": "hold", "unit": unit, "level": 0.0, "duration_s": 1.0}
-    needing = ("feedback", "adaptation", *(f"limits.{key}" for key in _tracking_keys()))
+    needing = ("feedback", "adaptation", "trigger", *(f"limits.{key}" for key in _tracking_keys()))
     removed = [f"{key}=null" for key in needing if document.holds(tuple(key.split(".")))]
     return [*settings, setting("waveform", hold), "compensator=none", *removed]
 

@@ -62,6 +62,19 @@ def test_check_prints_the_forecast(json_of):
     assert printed["samples"] == 50_000
 
 
+def test_check_lists_the_triggers(json_of, hilctl):
+    over = ["waveform.duration_s=1.0", "block=1", "sample_rate_hz=5000"]
+    words = ["check", DEMO, *(w for text in over for w in ("--set", text))]
+    assert json_of(*words)[1]["trigger"] is None
+    words += ["--set", "trigger={output: run, start: low, timeout_s: 7}"]
+    assert json_of(*words)[1]["trigger"] == {
+        "output": "run", "start": "low", "timeout_s": 7.0, "marks": 1,
+        "digital_output": "DO", "digital_output_s": 0.0, "digital_input": "DI",
+    }  # fmt: skip
+    row = hilctl(*words)[1]
+    assert all(each in row for each in ("DO", "(1)", "DI", "low", "7 s"))
+
+
 @pytest.mark.parametrize("as_json", [True, False])
 def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, hilctl, as_json):
     put = SafeResult("a device", 0.0, "A", "unknown", "no answer")

@@ -247,3 +247,22 @@ def test_a_check_tells():
     settings = ["sample_rate_hz=20000", "block=1", "waveform.duration_s=1.0"]
     checked = check(load_experiment(DEMO, settings))
     assert any("ticks per second" in each for each in checked.warnings)
+
+
+@pytest.mark.parametrize(
+    ("settings", "info", "keys"),
+    [
+        (["trigger={output: run}"], {"digital_output": ""}, ["trigger.output"]),
+        (["trigger={start: low}"], {"digital_input": ""}, ["trigger.start"]),
+        (["trigger={start: low}", "block=10"], {}, ["block"]),
+        (
+            ["trigger={output: run, start: high}", "block=10"],
+            {"digital_output": "", "digital_input": ""},
+            ["trigger.output", "trigger.start", "block"],
+        ),
+    ],
+)
+def test_triggers_need_channels_and_blocks_of_one_sample(settings, info, keys):
+    problems = refusals(CURRENT, *settings, **info)
+    assert [each.key for each in problems] == keys
+    assert all(each.hint or "must be 1" in each.rule for each in problems)

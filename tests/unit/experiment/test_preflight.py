@@ -631,3 +631,21 @@ def test_a_rest_before_the_waveform_does_not_make_the_last_run_forgotten(monkeyp
         found = check(compensated(made, initial_state=named, offset="measured"))
         assert found.conditioning() is not None
         assert found.begun.run_id == run_id
+
+
+SHORT = "{kind: sine, amplitude: 1.0, frequency_hz: 1000.0, duration_s: 0.0011}"
+
+
+@pytest.mark.parametrize(
+    ("waveform", "cure"),
+    [
+        ("{kind: hold, unit: A, level: 0.0, duration_s: 1.0}", "trigger.output=segment"),
+        (f"{{kind: sequence, unit: A, parts: [{SHORT}, {SHORT}]}}", "sample_rate_hz=20000"),
+    ],
+    ids=["no cycles", "marks of two parts in a row"],
+)
+def test_cycles_that_cannot_be_marked_are_refused(waveform, cure):
+    bad = (f"waveform={waveform}", "trigger={output: cycle}", "limits.slew_a_per_s=1e6")
+    (problem,) = refusals(CURRENT, *bad, digital_output="DO")
+    assert (problem.key, problem.value) == ("trigger.output", "cycle")
+    checked(CURRENT, *bad, cure, digital_output="DO")

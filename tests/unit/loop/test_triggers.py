@@ -39,6 +39,11 @@ def test_marks(kind, expected):
     assert marks_of(kind, SEGMENTS).tolist() == expected
 
 
+def test_a_cycle_without_a_sample_of_its_segment_has_no_mark():
+    segments = [Segment("sine", 0, 25, 0, 25, period=12.2), Segment("hold", 25, 40, 25, 40)]
+    assert marks_of("cycle", segments).tolist() == [0, 13]
+
+
 def test_cycles_do_not_drift():
     period, cycles = 1000.0 / 3.0, 3000
     marks = marks_of("cycle", [Segment("sine", 0, 1_000_000, 0, 1_000_000, period=period)])

@@ -283,6 +283,19 @@ def test_a_folder_that_comes_back_gets_the_recording(on_a_disk):
     assert (on_a_disk.error, on_a_disk.missing) == ("", 0)
 
 
+@pytest.mark.parametrize("refused", [[], [errno.ENOSPC]], ids=["at once", "after a retry"])
+def test_a_postponed_start_is_in_the_file(begun, refused):
+    made, disk = begun
+    disk.write_errors = refused
+    made.postpone(1_500_000_000)
+    made.batch(batch(0, 20))
+    assert made.finish(END, 200)
+    recording = read(made.path)
+    assert datetime.fromisoformat(recording.run["started"]).timestamp() == 1e9 + 1.5
+    assert np.array_equal(recording.samples.index, np.arange(200))
+    assert recording.run["run_id"] == made._run.facts["run_id"]
+
+
 def test_a_recording_that_is_deleted_before_the_start_is_refused(on_a_disk):
     shutil.rmtree(on_a_disk.path.parent)
     with pytest.raises(InputError, match="the file was deleted or renamed"):

@@ -102,3 +102,19 @@ def test_what_a_run_took_passes_to_the_other_side(sides):
     usage = ProcessUsage(98_000_000, 1_500, 12, 3, 4)
     one.leave_usage(usage)
     assert other.usage() == usage
+
+
+@pytest.mark.parametrize(
+    ("phase", "go", "stop", "state"),
+    [
+        (Phase.READY, 0, 0, "ready"),
+        (Phase.READY, 1, 0, "waiting"),
+        (Phase.READY, 1, Stop.REQUEST, "stopping"),
+        (Phase.RUNNING, 1, 0, "running"),
+    ],
+)
+def test_state(sides, phase, go, stop, state):
+    one, other = sides
+    for field, value in ((PageField.PHASE, phase), (PageField.GO, go), (PageField.STOP, stop)):
+        one.put(field, value)
+    assert other.state() == state
