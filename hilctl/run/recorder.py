@@ -377,11 +377,8 @@ class RingRecorder:
         # Before the samples: the ring then contains the samples that an event refers to.
         self._of_loop.extend(page.pop_events())
         for batch in self._ring.batches():
-            if (later_ns := page.get(PageField.START_NS) - self._start_ns) > 0:
-                recorder.postpone(later_ns)
-                self._start_ns += later_ns
             self.newest = batch.rows(slice(-1, None))
-            recorder.batch(batch)
+            self._record(batch)
             took = True
         # Before the first sample the start may still be postponed, which writes the file again.
         if self.newest is None and not self._ending.is_set():
@@ -395,6 +392,13 @@ class RingRecorder:
             page.leave_note(event)
         return took
 
+    def _record(self, batch: BlockBatch) -> None:
+        """Record a batch, after the time of a start that was postponed."""
+        if (later_ns := self._ring.page.get(PageField.START_NS) - self._start_ns) > 0:
+            self.recorder.postpone(later_ns)
+            self._start_ns += later_ns
+        self.recorder.batch(batch)
+
     def _drain_all(self) -> None:
         while self._drain():
             pass
@@ -407,7 +411,7 @@ class RingRecorder:
             self._drain_all()
         if self._lost_loop:
             if (batch := self._ring.unanswered(recorder.next_sample)) is not None:
-                recorder.batch(batch)
+                self._record(batch)
             ended_at = max(recorder.next_sample, page.get(PageField.ENDED_AT))
             outcome = replace(outcome, ended_at=ended_at)
         facts = end_facts(outcome, page.lateness(), page.get(PageField.EVENTS_LOST))

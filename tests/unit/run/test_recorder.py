@@ -378,6 +378,16 @@ def test_a_later_start_is_written_before_the_first_sample(ring, recording):
     assert len(recording.recorder.events) == 1
 
 
+def test_a_loop_lost_in_its_first_exchange_leaves_its_later_start(ring, recording):
+    recording._start_ns = 100
+    ring.page.put(PageField.START_NS, 130)
+    exchange(ring, 1, answered=False)
+    recording.end(ENDED, lost_loop=True)
+    recording._finish()
+    assert recording.recorder.postponed == [(30, 0)]
+    assert recording.recorder.firsts == [0]
+
+
 def test_room_is_given_back_once_the_file_has_what_stood_there(ring, recording):
     exchange(ring, 3)
     recording._work()
