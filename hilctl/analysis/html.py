@@ -67,13 +67,15 @@ summary { cursor: pointer; }
 dt { font-weight: 600; break-after: avoid; } dd { margin: 0 0 .4rem 1rem; break-inside: avoid; }
 .wide { overflow-x: auto; }
 .wide th { white-space: normal; }
+@media (max-width: 30rem) { th { white-space: normal; } }
 @page { margin: 12mm; }
 @media print { html { font-size: 8.5pt; } body { max-width: none; padding: 0; line-height: 1.3; }
   main { columns: 2; column-gap: 5mm; } .figures, .side { columns: auto; }
-  h1, .file, .headline, .headline + p, .note, .bad, h2:has(+ .wide th:nth-child(5)),
+  h1, main > p:not(h2 ~ p), h2:has(+ .wide th:nth-child(5)),
   main > .wide:has(th:nth-child(5)) { column-span: all; }
   h2 { break-after: avoid; margin-top: 0; padding-top: 1rem; }
   tr, main > .wide:not(:has(th:nth-child(5))) { break-inside: avoid; }
+  tr:nth-child(-n+2), tr:nth-last-child(2) { break-after: avoid; }
   th, td { padding: .1rem .6rem .1rem 0; }
   .side, .side section { margin: 0; break-inside: auto; } .figures svg { max-width: 66mm; }
   .wide { overflow: visible; } .wide:has(th:nth-child(10)) { font-size: 72%; }

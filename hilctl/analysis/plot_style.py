@@ -8,7 +8,7 @@ from typing import Any
 
 import numpy as np
 from matplotlib.axes import Axes
-from matplotlib.ticker import LogLocator, NullFormatter
+from matplotlib.ticker import LogLocator, MaxNLocator, NullFormatter
 
 from hilctl.base.types import F64, I64
 from hilctl.recording.recording import Recording
@@ -124,11 +124,17 @@ def draw_line(
 
 
 def plain_numbers(axes: Axes) -> None:
-    """Write the ticks of logarithmic axes as plain numbers; 1, 2 and 5 in a narrow range."""
+    """Write the ticks of logarithmic axes as plain numbers: decades; 1, 2 and 5; or equal steps.
+
+    The narrower the range, the later of these applies.
+    """
     for axis in (axes.xaxis, axes.yaxis):
         if axis.get_scale() == "log":
             low, high = axis.get_view_interval()
-            axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100.0 * low else (1,)))
+            if high < 5.0 * low:  # may have a single one of 1, 2 and 5
+                axis.set_major_locator(MaxNLocator(5, steps=(1, 2, 5, 10)))
+            else:
+                axis.set_major_locator(LogLocator(subs=(1, 2, 5) if high < 100.0 * low else (1,)))
             axis.set_major_formatter("{x:g}")
             axis.set_minor_formatter(NullFormatter())
 

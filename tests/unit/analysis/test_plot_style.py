@@ -2,6 +2,7 @@
 
 import numpy as np
 import pytest
+from matplotlib.figure import Figure
 
 from hilctl.analysis import plot_style
 
@@ -57,3 +58,19 @@ def test_band_is_for_many_narrow_cycles() -> None:
     assert not plot_style.shown_as_band(100_000, 2000.0, 100_000)
     assert not plot_style.shown_as_band(700, 200.0, 100_000)
     assert not plot_style.shown_as_band(100_000, 0.0, 100_000)
+
+
+@pytest.mark.parametrize(
+    ("low", "high", "expected"),
+    [
+        (0.13, 0.36, [0.15, 0.2, 0.25, 0.3, 0.35]),
+        (0.9, 80.0, [1.0, 2.0, 5.0, 10.0, 20.0, 50.0]),
+        (0.9, 2000.0, [1.0, 10.0, 100.0, 1000.0]),
+    ],
+)
+def test_a_logarithmic_axis_has_few_ticks(low: float, high: float, expected: list[float]) -> None:
+    axes = Figure().subplots()
+    axes.set(yscale="log", ylim=(low, high))
+    plot_style.plain_numbers(axes)
+    shown = [tick for tick in axes.get_yticks() if low <= tick <= high]
+    np.testing.assert_allclose(shown, expected)
