@@ -301,7 +301,8 @@ function axes(yLabel, xLabel, more = {}) {
   const font = `${Math.round(0.8 * size)}px system-ui, sans-serif`;
   return [
     { ...look, font, label: xLabel, labelFont: font, labelSize: 1.3 * size, size: 1.9 * size, space: 5 * size, ...more },
-    { ...look, font, label: yLabel, labelFont: font, labelSize: 1.4 * size, size: 4.2 * size },
+    { ...look, font, label: yLabel, labelFont: font, labelSize: 1.4 * size, size: 4.2 * size,
+      space: (plot, axis, low, high, height) => Math.min(2 * size, 0.2 * height) },
   ];
 }
 
