@@ -78,7 +78,7 @@ class Job:
         return cls(
             experiment=loaded.yaml_text,
             files=loaded.files.texts,
-            folder=str(loaded.folder.resolve()),
+            folder=str(loaded.folder.absolute()),  # a link stays, as in the names of the texts
             ring=str(folder.ring),
             reference=str(reference),
             input_um=str(input_um),

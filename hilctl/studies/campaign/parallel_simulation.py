@@ -92,7 +92,7 @@ def run_fast(plan: CampaignPlan, host: StudyHost, scheduler: str = "none") -> Ca
 
 def _task(each: PlannedStep) -> FastTask:
     loaded = each.loaded
-    folder = str(loaded.folder.resolve())
+    folder = str(loaded.folder.absolute())  # a link stays, as in the names of the texts
     return FastTask(loaded.yaml_text, dict(loaded.files.texts), folder, each.heat_a2)
 
 

@@ -30,12 +30,11 @@ def folder(tmp_path):
 
 def test_the_job_is_what_was_checked_even_where_its_files_have_gone(folder, tmp_path):
     """Between the check and the start a model file may change: the run is the checked one."""
-    shutil.copy(CONFIGS / "demo.yaml", tmp_path)
-    shutil.copytree(CONFIGS / "models", tmp_path / "models")
-    checked = checked_experiment(tmp_path / "demo.yaml", ["waveform.duration_s=1.0"])
+    shutil.copytree(CONFIGS, tmp_path / "configs")
+    (tmp_path / "link").symlink_to("configs")
+    checked = checked_experiment(tmp_path / "link/demo.yaml", ["waveform.duration_s=1.0"])
     job = Job.of(checked, folder, supervisor=7, silence_s=5.0)
-    shutil.rmtree(tmp_path / "models")
-    (tmp_path / "demo.yaml").unlink()
+    shutil.rmtree(tmp_path / "configs")
     job.write(folder.job)
     again = Job.read(folder.job)
     assert again == job
