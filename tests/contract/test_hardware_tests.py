@@ -9,6 +9,7 @@ from pathlib import Path
 import pytest
 
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
+from hilctl_drivers.signal_chain import Amplifier, Sensor
 from tests.fakes import emulated, logged
 
 ROOT = Path(__file__).parents[2]
@@ -26,7 +27,7 @@ device:
   host: 127.0.0.1
   tcp_port: {port}
   output: DAC0
-  input: {sensor}
+  input: AIN0
   timeout_s: 2.0
   amplifier: {{gain_a_per_v: 4.0, offset_a: -10.0}}
   sensor: {{um_per_v: 12.5}}
@@ -59,11 +60,11 @@ def suite(tmp_path):
     It returns the result, and every output current.
     """
 
-    def run(sensor="AIN0", only="test", faults=()):
+    def run(only="test", **options):
         log, path = tmp_path / "writes.jsonl", tmp_path / "experiment.yaml"
-        with emulated(EmulatorOptions("labjack_t7", log=log, faults=faults)) as emulator:
+        with emulated(EmulatorOptions("labjack_t7", log=log, **options)) as emulator:
             port = emulator.address.rpartition(":")[2]
-            path.write_text(EXPERIMENT.format(port=port, sensor=sensor), encoding="utf-8")
+            path.write_text(EXPERIMENT.format(port=port), encoding="utf-8")
             done = ran("-q", "-k", only, "--device", str(path))
         return done, [each["current_a"] for each in logged(log)]
 
@@ -98,8 +99,9 @@ def test_failure_ends_at_the_safe_value(suite):
 
 
 @pytest.mark.slow
-def test_sensor_that_shows_nothing_is_found(suite):
-    done, currents_a = suite(sensor="AIN1", only="small_move")
+def test_amplifier_that_is_off_is_found(suite):
+    off = Amplifier(gain_a_per_v=1e-9, offset_a=-2.5e-9), Sensor(um_per_v=12.5)
+    done, currents_a = suite(only="small_move", wiring=off)
     assert done.returncode == 1
     assert "nothing moved" in done.stdout
     assert currents_a[-1] == 0.0

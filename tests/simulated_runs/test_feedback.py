@@ -19,7 +19,7 @@ BASE = ("sample_rate_hz=5000", "block=1", "waveform.frequency_hz=5.0", "waveform
 OMEGA = "compensator.model=models/terfenol_omega.yaml"
 STAGED = "compensator.model=models/terfenol_staged.yaml"
 FEEDBACK = (
-    "feedback={limit_um: 10.0, bandwidth_hz: 100.0, resonance_hz: 2300.0, damping_ratio: 0.12}"
+    "feedback={limit_um: 10.0, bandwidth_hz: 80.0, resonance_hz: 2300.0, damping_ratio: 0.12}"
 )
 INTEGRAL = "feedback={kind: integral, bandwidth_hz: 5.0, limit_um: 10.0}"
 DRIFT = "device.drift={um: 6.0, tau_s: 0.3}"
