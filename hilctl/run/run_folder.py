@@ -225,6 +225,7 @@ def keep_removed() -> None:
                 shutil.copyfile(opened, folder / f"{_CARD}.new")
                 # Last: a folder with a card is a dead run, whose ring is whole.
                 (folder / f"{_CARD}.new").rename(card)
+                os.truncate(opened, 0)  # the run is found once, also until this process has ended
 
 
 @contextmanager

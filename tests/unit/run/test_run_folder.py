@@ -137,6 +137,8 @@ def test_what_a_process_has_of_a_removed_folder_is_kept(tmp_path):
             assert (folder.path / "ring").read_text() == "samples"
             with taken_over(found) as ours:
                 assert ours
+            found.remove()
+            assert runs() == []  # although this process still has the removed files open
 
 
 def test_no_run_looks_dead_or_can_be_taken_over_while_its_folder_is_removed(tmp_path, monkeypatch):
