@@ -1,7 +1,8 @@
 """Time what a tick costs beside the device: from each wake-up to the next sleep, less the exchange.
 
 Run it with ``python -m tests.benchmark.tick``; see README.md beside it. It runs the loop process's
-own code on the simulated rig, one sample per tick, with a clock that records each sleep.
+own code on the simulated rig with a clock that records each sleep. With ``--aux``, runs without and
+with auxiliary channels take turns, so that both have the same load of the machine.
 """
 
 import argparse
@@ -10,13 +11,17 @@ import sys
 import tempfile
 import threading
 import time
+from collections.abc import Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import ClassVar
 
 import numpy as np
 
+from hilctl.base.device import AuxChannel
 from hilctl.base.private_dirs import memory_folder
 from hilctl.base.samples import BlockHeader
+from hilctl.experiment.devices import BUILTIN
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, check
 from hilctl.loop.pacer import SystemClock
@@ -26,10 +31,30 @@ from hilctl.run.job import Job
 from hilctl.run.run_folder import RunCard, RunFolder
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, Phase, SharedPage
+from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
 MODELS = EXPERIMENT.parent / "models"
+ROUNDS = 6  # of a comparison
+CHANNELS = ("a_c", "b_c", "c_c", "d_c")
+WITH_CHANNELS = (
+    "device.kind=four_channels",
+    f"limits.aux={{{', '.join(f'{name}: 80' for name in CHANNELS)}}}",
+)
 SHIPPED = [MODELS / f"{name}.yaml" for name in ("terfenol_omega", "terfenol_staged")]
+
+
+class FourChannels(SimulatedTerfenol):
+    """The rig with auxiliary channels of constant values, which cost the device nothing."""
+
+    def __init__(self, options: TerfenolOptions) -> None:
+        super().__init__(options)
+        channels = tuple(AuxChannel(name, "°C", "") for name in CHANNELS)
+        self._info = replace(self._info, aux=channels)
+        self.aux = np.full(len(channels), 25.0)
+
+
+BUILTIN["four_channels"] = f"{__name__}:FourChannels"
 
 
 class TimedClock(SystemClock):
@@ -44,16 +69,18 @@ class TimedClock(SystemClock):
         self.woke.append(time.monotonic_ns())
 
 
-def experiment(options: argparse.Namespace, model: Path) -> LoadedExperiment:
-    """Return the shipped experiment with a model, one sample per tick."""
-    settings = {
+def experiment(
+    options: argparse.Namespace, model: Path, settings: Sequence[str]
+) -> LoadedExperiment:
+    """Return the shipped experiment with a model."""
+    own = {
         "sample_rate_hz": float(options.rate),
-        "block": 1,
+        "block": options.block,
         "waveform.frequency_hz": 1.0,
-        "waveform.duration_s": options.ticks / options.rate,
+        "waveform.duration_s": options.ticks * options.block / options.rate,
         "compensator.model": model.resolve(),
     }
-    return load_experiment(EXPERIMENT, [f"{key}={value}" for key, value in settings.items()])
+    return load_experiment(EXPERIMENT, [*(f"{k}={value}" for k, value in own.items()), *settings])
 
 
 def job(folder: RunFolder, checked: CheckedExperiment) -> Job:
@@ -69,9 +96,11 @@ def start(page: SharedPage) -> None:
     page.put(PageField.GO, 1)
 
 
-def ticks_us(options: argparse.Namespace, model: Path) -> tuple[np.ndarray, np.ndarray]:
+def ticks_us(
+    options: argparse.Namespace, model: Path, settings: Sequence[str] = ()
+) -> tuple[np.ndarray, np.ndarray]:
     """Run the loop; return the cost of each tick beside the exchange, and the exchange, in us."""
-    checked = check(experiment(options, model))
+    checked = check(experiment(options, model, settings))
     TimedClock.slept.clear()
     TimedClock.woke.clear()
     config = checked.loaded.config
@@ -79,7 +108,13 @@ def ticks_us(options: argparse.Namespace, model: Path) -> tuple[np.ndarray, np.n
     loop_process.SystemClock = TimedClock  # type: ignore[misc]
     with tempfile.TemporaryDirectory(prefix="hilctl-", dir=memory_folder()) as name:
         folder = RunFolder(Path(name), RunCard("tick", "tick", "", os.getpid(), 0.0))
-        ring = SampleRing.create(folder.ring, slots=slots, block=1, state_size=checked.state_size)
+        ring = SampleRing.create(
+            folder.ring,
+            slots=slots,
+            block=options.block,
+            state_size=checked.state_size,
+            aux=len(checked.loaded.device.info.aux),
+        )
         work = job(folder, checked)
         threading.Thread(target=start, args=(ring.page,), daemon=True).start()
         outcome = loop_process.run_job(work, ring)
@@ -102,7 +137,9 @@ def main() -> int:
     """Run the benchmark; the exit code is 1 if a median is above its target."""
     parser = argparse.ArgumentParser(description=__doc__.split("\n", maxsplit=1)[0])
     parser.add_argument("--ticks", type=int, default=10_000)
-    parser.add_argument("--rate", type=float, default=1000.0, help="ticks per second")
+    parser.add_argument("--rate", type=float, default=1000.0, help="samples per second")
+    parser.add_argument("--block", type=int, default=1, help="samples per tick")
+    parser.add_argument("--aux", action="store_true", help="compare with four auxiliary channels")
     parser.add_argument("--priority", type=int, default=80)
     parser.add_argument("--model", type=Path, help="model file; default: Omega and staged")
     parser.add_argument("--max-us", type=float, default=25.0, help="target of the median")
@@ -116,6 +153,13 @@ def main() -> int:
         print(f"{model.stem}: target {options.max_us:g} us")
         print(f"  tick beside the device  {figures(tick_us)}")
         print(f"  simulated device        {figures(exchange_us)}")
+        if options.aux:
+            medians_us = [
+                [np.median(ticks_us(options, model, settings)[0]) for settings in pair]
+                for pair in [((), WITH_CHANNELS)] * ROUNDS
+            ]
+            none_us, four_us = np.min(medians_us, axis=0)  # other load only adds
+            print(f"  with four channels      {four_us / none_us:.2f} times {none_us:.1f} us")
     return int(missed)
 
 
