@@ -138,7 +138,7 @@ class DacSetup:
 
     def digital_session(self, link: Link) -> Any:
         """Return the session with the digital channels; None if none is in use."""
-        if self.digital_output is None is self.digital_input:
+        if self.digital_output is None and self.digital_input is None:
             return None
         return cast("type[SessionReader]", _reader_class(self.writer)).session_on(self.writer, link)
 

@@ -512,8 +512,10 @@ class Document:
 
     def value(self, loc: Loc) -> Any:
         """Return the value at a location; None without one."""
-        found: Any = self.data if self.holds(loc) else None
-        for part in loc if self.holds(loc) else ():
+        if not self.holds(loc):
+            return None
+        found: Any = self.data
+        for part in loc:
             found = found[part]
         return found
 

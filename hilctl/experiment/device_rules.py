@@ -187,7 +187,7 @@ def _unmet(needs: InterlockRequirement, loaded: LoadedExperiment) -> Iterator[st
 
 
 def _trigger_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
-    """Yield the triggers without a channel of the device, and a block that hides their sample."""
+    """Yield a problem for each trigger whose channel the device lacks, and for a block above 1."""
     trigger, info = loaded.config.trigger, loaded.device.info
     if trigger is None:
         return

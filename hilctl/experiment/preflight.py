@@ -152,7 +152,7 @@ def check(
 
 
 def _mark_problems(loaded: LoadedExperiment, reference: Reference) -> list[ConfigProblem]:
-    """Return that the waveform has no cycles to mark, or marks that are too close."""
+    """Return a problem if the waveform has no cycle to mark, or if marks are too close."""
     trigger = loaded.config.trigger
     if trigger is None or trigger.output is None:
         return []
