@@ -55,6 +55,21 @@ class VoltageLimit(DeviceOptions):
 _TAKEN = {"sample", "t_s", "flags", *(each.name for each in RECORDED_FIELDS)}
 
 
+def limited_range(limits: object) -> tuple[float, float] | None:
+    """Return the range of the drive, A or V, in an experiment's section of limits, not validated.
+
+    None if it sets none, or no valid one.
+    """
+    match limits:
+        case {"peak_current_a": int() | float() as high} if high > 0.0:
+            return -high, high
+        case {"drive_a": (int() | float() as low, int() | float() as high)} | {
+            "drive_v": (int() | float() as low, int() | float() as high)
+        } if low < high:
+            return low, high  # fmt: skip
+    return None
+
+
 @dataclass(frozen=True, slots=True)
 class AuxChannel:
     """An auxiliary channel: another input of the device, such as a temperature.

@@ -12,7 +12,7 @@ from pathlib import Path
 from pkgutil import resolve_name
 from typing import Any
 
-from hilctl.base.device import DeviceInfo
+from hilctl.base.device import DeviceInfo, limited_range
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
@@ -191,13 +191,8 @@ def _first_values(info: DeviceInfo, limits: object) -> tuple[dict[str, Any], dic
 
 def _range_of(limits: object, info: DeviceInfo) -> tuple[float, float]:
     """Return the range that the limits set, or a share of the device's."""
-    match limits:
-        case {"peak_current_a": int() | float() as high} if high > 0.0:
-            return -high, high
-        case {"drive_a": (int() | float() as low, int() | float() as high)} | {
-            "drive_v": (int() | float() as low, int() | float() as high)
-        } if low < high:
-            return low, high  # fmt: skip
+    if (stated := limited_range(limits)) is not None:
+        return stated
     low, high = (_rounded(_SHARE * each, 2) for each in (info.command_min, info.command_max))
     return low, high
 

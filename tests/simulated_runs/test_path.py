@@ -8,7 +8,7 @@ from hilctl.recording.reader import read
 from hilctl_drivers.simulated.devices import PiezoStage
 from tests.simulated_runs.test_wires import BOARD, Wire, emulated
 
-STAGE = f"device.stage={PiezoStage.fitted(-100.0, 100.0, 38.0).model_dump_json()}"
+STAGE = f"device.stage={PiezoStage.fitted((-100.0, 100.0), 38.0, 100.0).model_dump_json()}"
 QUICK = ("sample_rate_hz=1000", "block=10")
 
 RIGS = {

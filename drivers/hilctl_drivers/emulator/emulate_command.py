@@ -12,6 +12,7 @@ from typing import Annotated, Any, cast
 
 import typer
 
+from hilctl.base.device import limited_range
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import finite_json
@@ -88,6 +89,7 @@ def wired_experiment(
         reader_port=_port(reader),
         actuator=_actuator(unit, actuator, document.data.get("amplifier")),
         wiring=(options.amplifier, options.sensor),
+        limits=limited_range(document.data.get("limits")),
     )
     return WiredExperiment(path, section, made)
 

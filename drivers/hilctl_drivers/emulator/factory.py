@@ -5,7 +5,7 @@ or each has a port of its own, with any protocol.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
@@ -25,7 +25,12 @@ from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_base import BaseProfile, Range, SerialLineSettings
 from hilctl_drivers.sensor_stream.stream_profile import StreamProfile
-from hilctl_drivers.simulated.devices import PiezoOptions, PiezoStage, SimulatedDevice
+from hilctl_drivers.simulated.devices import (
+    PiezoOptions,
+    PiezoStage,
+    SimulatedDevice,
+    TerfenolOptions,
+)
 
 AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard | EmulatedStream
 _DRIVE_V, _RANGE_UM = 100.0, 50.0  # of a piezo stage if no wiring is given
@@ -261,15 +266,21 @@ def _rig(
     options: EmulatorOptions, output: Range, sensor_input: Range
 ) -> tuple[SimulatedDevice, SimulatedWiring]:
     """Return the actuator and its wiring to an output and an input; each may follow the other."""
-    actuator, given = options.actuator, options.wiring
+    actuator, given, limits = options.actuator, options.wiring, options.limits
     wiring = None if given is None else SimulatedWiring(output, sensor_input, *given)
+    if limits is not None and isinstance(actuator, TerfenolOptions):
+        # What the user has stated is stronger.
+        rated = {"rated_current_a": max(map(abs, limits))} | actuator.model_dump(exclude_unset=True)
+        actuator = TerfenolOptions.model_validate(rated)
     if isinstance(actuator, PiezoOptions) and (actuator.physics, actuator.stage) == ("plays", None):
         if wiring is None:  # 0 V of an output drives with 0 V
             share = min(0.0, output.min) / max(abs(output.min), abs(output.max))
-            stage = PiezoStage.fitted(share * _DRIVE_V, _DRIVE_V, _RANGE_UM)
+            drive_v: Sequence[float] = (share * _DRIVE_V, _DRIVE_V)
+            range_um = _RANGE_UM
         else:
-            (low_v, high_v), reach_um = wiring.command_range, wiring.displacement_range
-            stage = PiezoStage.fitted(low_v, high_v, max(map(abs, reach_um)))
+            drive_v = wiring.command_range
+            range_um = max(map(abs, wiring.displacement_range))
+        stage = PiezoStage.fitted(drive_v, range_um, max(map(abs, limits or drive_v)))
         actuator = actuator.model_copy(update={"stage": stage})
     make: Any = next(each for each in ACTUATORS.values() if each.Options is type(actuator))
     device: SimulatedDevice = make(actuator)

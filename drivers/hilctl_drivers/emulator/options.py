@@ -110,8 +110,9 @@ class EmulatorOptions:
     reader_port: int = 0  # TCP port of its own; 0 for a free one
     lacking: frozenset[int] = frozenset()  # functions that are refused with exception 1
     mute: frozenset[int] = frozenset()  # functions that are never answered
-    # Of a piezo without a stage of its own, the published stage is scaled to the wiring.
+    # A rated current or stage that it does not state is that of the limits, or of the wiring.
     actuator: SimulatedOptions = field(default_factory=TerfenolOptions)
     # Amplifier and sensor; spread over the channels' ranges if None.
     wiring: tuple[Amplifier | None, Sensor] | None = None
+    limits: tuple[float, float] | None = None  # of an experiment's drive, A or V
     command: float | None = None  # initial command, as if it was the power-up value

@@ -7,6 +7,7 @@ buffered.
 
 import math
 from abc import abstractmethod
+from collections.abc import Sequence
 from dataclasses import asdict, replace
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
@@ -40,6 +41,7 @@ from hilctl_drivers.simulated.thermal_switching import SwitchingParameters
 
 FIFO_DEPTH = 4096
 MAX_RATE_HZ = 200e3
+RATED_CURRENT_A = 7.07  # 5 A rms through the published coil
 _SETTLING_S = 0.1
 _S_SHAPE = 1.5 * 3.0**0.5  # 1 / largest value of x - x^3
 _LOST = {
@@ -312,11 +314,18 @@ class TerfenolOptions(SimulatedOptions):
         le=8.0,
         description="constant current added to the command, A; displacement is zero there",
     )
-    current_max_a: float = Field(
-        default=10.0,
+    rated_current_a: float = Field(
+        default=RATED_CURRENT_A,
         gt=0.0,
-        le=10.0,
-        description="largest current accepted either way, bias and command together, A",
+        le=1e3,
+        description="current of the rated field, A; another one than the default is another coil"
+        " around the same rods, with a DAC whose range grows alike",
+    )
+    current_max_a: float | None = Field(
+        default=None,
+        gt=0.0,
+        description="largest current accepted either way, bias and command together, A; default:"
+        " the DAC's range, 10 A with the default coil",
     )
     vary: Variation = Field(
         default=Variation(), description="factors on the rated actuator, for tests of robustness"
@@ -346,23 +355,34 @@ class TerfenolOptions(SimulatedOptions):
 
     @model_validator(mode="after")
     def _room(self) -> Self:
-        if not abs(self.bias_a) < self.current_max_a:
+        low, high = self.command_range_a
+        if not low < 0.0 < high:
             raise ValueError(
-                f"bias_a must leave room for a command within current_max_a, "
-                f"{self.current_max_a:g} A: {self.bias_a:g}"
+                f"bias_a must leave room for a command of either sign within current_max_a, or the"
+                f" DAC's range without it: {self.bias_a:g} A"
             )
         return self
 
     @property
     def command_range_a(self) -> tuple[float, float]:
         """Lowest and highest command: with the bias it must stay within ``current_max_a``."""
-        dac_a = TerfenolParameters().dac_range_a
-        low, high = -self.current_max_a - self.bias_a, self.current_max_a - self.bias_a
+        dac_a = TerfenolParameters().dac_range_a / self._turns
+        most_a = dac_a if self.current_max_a is None else self.current_max_a
+        low, high = -most_a - self.bias_a, most_a - self.bias_a
         return max(-dac_a, low), min(dac_a, high)
+
+    @property
+    def _turns(self) -> float:
+        """Turns of the coil relative to the published one."""
+        return RATED_CURRENT_A / self.rated_current_a
 
     def parameters(self) -> TerfenolParameters:
         """Return the actuator that the options describe."""
-        rated = TerfenolParameters(
+        published = TerfenolParameters()
+        rated = replace(
+            published,
+            dac_range_a=published.dac_range_a / self._turns,
+            coil_factor_per_m=published.coil_factor_per_m * self._turns,
             rods=PHYSICS[self.physics](),
             creep=self.creep,
             thermal=self.thermal,
@@ -400,16 +420,16 @@ class PiezoStage(DeviceOptions):
         return self
 
     @classmethod
-    def fitted(cls, low_v: float, high_v: float, range_um: float) -> Self:
+    def fitted(cls, drive_v: Sequence[float], range_um: float, rated_v: float) -> Self:
         """Return the published stage, scaled to another drive and another range of the sensor.
 
-        The largest voltage of either sign moves it through 80 % of the sensor's range.
+        ``rated_v`` moves it through 80 % of the sensor's range.
         """
-        rated, top_v = PiezoParameters(), max(abs(low_v), abs(high_v))
-        volts, um = top_v / rated.drive_max_v, 0.7 * range_um / rated.sensor_range_um
+        rated = PiezoParameters()
+        volts, um = rated_v / rated.drive_max_v, 0.7 * range_um / rated.sensor_range_um
         return cls(
-            drive_min_v=min(0.0, low_v),
-            drive_max_v=top_v,
+            drive_min_v=min(0.0, drive_v[0]),
+            drive_max_v=max(map(abs, drive_v)),
             slope_um_per_v=rated.slope_um_per_v * um / volts,
             thresholds_v=tuple(each * volts for each in rated.thresholds_v),
             weights_um_per_v=tuple(each * um / volts for each in rated.weights_um_per_v),

@@ -109,7 +109,9 @@ def test_it_has_the_amplifier_of_the_experiment(tmp_path):
     limit = "amplifier: {voltage_max_v: 36, resistance_ohm: 4, inductance_h: 0.003}\n"
     path = tmp_path / "rig.yaml"
     path.write_text(limit + (CONFIGS / "modbus_labjack_t7.yaml").read_text())
-    assert wired_experiment(path).options.actuator.amplifier.voltage_max_v == 36.0
+    options = wired_experiment(path).options
+    assert options.actuator.amplifier.voltage_max_v == 36.0
+    assert options.limits == (-7.07, 7.07)
 
 
 T8_PIEZO = """\

@@ -43,6 +43,24 @@ def test_a_piezo_is_scaled_to_its_wiring(emulate, gain, offset_v, um_per_v, low_
     assert rig.displacement_um == pytest.approx(0.8 * 10.0 * abs(um_per_v), rel=0.01)
 
 
+def test_the_limits_rate_the_actuator(emulate):
+    strokes_um = []
+    for actuator, limits in [
+        (TerfenolOptions(noise=False), (-0.5, 0.5)),
+        (TerfenolOptions(noise=False, rated_current_a=7.07), (-0.5, 0.5)),
+        (PiezoOptions(noise=False), (0.0, 20.0)),
+    ]:
+        gain = f"gain_{'v' if isinstance(actuator, PiezoOptions) else 'a'}_per_v"
+        wiring = Amplifier.model_validate({gain: 10.0}), Sensor(um_per_v=5.0)
+        made = emulate("labjack_t8", actuator=actuator, wiring=wiring, limits=limits, command=0.0)
+        made.device._rig.put_out(limits[1], made.now_ns)
+        made.device._rig.advance(made.now_ns + 10 * MS)
+        strokes_um.append(made.device._rig.displacement_um)
+    rated_um, published_um, piezo_um = strokes_um
+    assert rated_um > 10.0 * published_um
+    assert piezo_um == pytest.approx(0.8 * 50.0, rel=0.01)
+
+
 @pytest.mark.parametrize(("profile", "options", "words"), [
     ("waveshare_ao_8ch", {}, "has no input to show a displacement at: name a reader"),
     ("waveshare_ai_8ch", {}, "has no output to drive .*: it can be another one's reader"),
