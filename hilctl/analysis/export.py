@@ -158,15 +158,11 @@ def write_parquet(stream: BinaryIO, table: Columns, facts: Facts) -> None:
 
 @dataclass(slots=True)
 class ExportedAll:
-    """Result of the export of a folder.
-
-    Attributes:
-        there: Number of files that existed and were not changed.
-        left_out: Reason why a recording was not written, by its path in the folder.
-    """
+    """Result of the export of a folder."""
 
     written: int = 0
-    there: int = 0
+    there: int = 0  # number of files that existed and were not changed
+    # reason why a recording was not written, by its path in the folder
     left_out: dict[str, str] = field(default_factory=dict)
 
 

@@ -46,36 +46,27 @@ _FEWEST_NAMED = 2  # a single line is named by its axes
 
 @dataclass(frozen=True, slots=True)
 class Panel:
-    """One pair of axes, drawn and labelled by a function.
-
-    Attributes:
-        title: Title, prefixed by a letter if there are several panels.
-        height: Share of its width, in a column of its own.
-    """
+    """One pair of axes, drawn and labelled by a function."""
 
     draw: Callable[[Axes], None]
-    title: str = ""
-    height: float = 0.62
+    title: str = ""  # prefixed by a letter if there are several panels
+    height: float = 0.62  # of its width, in a column of its own
 
 
 @dataclass(frozen=True, slots=True)
 class FigureSpec:
     """A figure of one or more panels, with one legend below all of them.
 
-    Attributes:
-        name: Name of its file.
-        alike: Whether panels have the same axes: then a single column has two side by side, and
-            only the outer axes have labels.
-        stacked: Whether panels share the x axis, one below the other.
-        most_beside: Most panels side by side in two columns.
+    Panels that are ``alike`` have the same axes: then a single column has two side by side, and
+    only the outer axes have labels.
     """
 
-    name: str
+    name: str  # name of its file
     caption: str
     panels: tuple[Panel, ...]
     alike: bool = False
-    stacked: bool = False
-    most_beside: int = 3
+    stacked: bool = False  # whether panels share the x axis, one below the other
+    most_beside: int = 3  # most panels side by side in two columns
 
 
 @mpl.rc_context(STYLE)

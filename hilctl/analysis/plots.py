@@ -61,18 +61,11 @@ _WIDEST_GAP = 0.02  # share of samples that may be missing
 
 @dataclass(frozen=True, slots=True)
 class ErrorSpectrum:
-    """Spectrum of the error over steady samples.
+    """Spectrum of the error over steady samples."""
 
-    Attributes:
-        frequency_hz: float64[k], > 0.
-        amplitude_um: float64[k], amplitude of a sine there, Hann window.
-        harmonics_um: float64[h], amplitude at 1, 2, ... times the waveform's frequency; empty
-            without a period.
-    """
-
-    frequency_hz: F64
-    amplitude_um: F64
-    harmonics_um: F64
+    frequency_hz: F64  # float64[k], > 0
+    amplitude_um: F64  # float64[k], amplitude of a sine there, Hann window
+    harmonics_um: F64  # float64[h], amplitude at 1, 2, ... times the waveform's frequency, or empty
 
 
 def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um: F64

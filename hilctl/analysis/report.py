@@ -45,13 +45,9 @@ Windows: TypeAlias = list[tuple[Segment, tuple[int, int, int]]]
 def summarize(recording: Recording | Iterable[Recording]) -> RunReport:
     """Return the report of a recording, complete or truncated.
 
-    Args:
-        recording: The run, or its pieces in order for bounded memory, as a repeatable iterable
-            (:class:`hilctl.recording.reader.RecordingStream`): a run that ended early or was tuned
-            is read twice.
-
-    Raises:
-        DataError: A counter in the metadata of the end is not a number.
+    For bounded memory, ``recording`` is the run's pieces in order as a repeatable iterable
+    (:class:`hilctl.recording.reader.RecordingStream`): a run that ended early or was tuned is read
+    twice. Raise DataError if a counter in the metadata of the end is not a number.
     """
     pieces = [recording] if isinstance(recording, Recording) else recording
     return build_report(pieces).report()

@@ -16,22 +16,17 @@ from hilctl.signals.cycle_metrics import MeanCycle, fold
 
 @dataclass(frozen=True, slots=True)
 class SteadyPart:
-    """Steady samples of one segment.
+    """Steady samples of one segment, and the loop that is evaluated.
 
-    Attributes:
-        samples: Whole cycles of a periodic waveform, otherwise all samples at full amplitude.
-        cycles: Number of whole cycles; 0 without a period.
-        cycle: The average cycle of the loop's input and displacement_um, phase 0 at the segment's
-            first sample; None without a whole cycle.
-        loop: float64[2, m], input and displacement of the evaluated loop: the average cycle, or
-            every finite sample without a period; empty if the cycle is incomplete. Its input is
-            reference_um with a compensator, otherwise the command.
+    The loop's input is reference_um with a compensator, otherwise the command. The loop is the
+    average cycle, or every finite sample without a period; empty if the cycle is incomplete.
     """
 
-    samples: Samples
-    cycles: int
+    samples: Samples  # whole cycles of a periodic waveform, otherwise all at full amplitude
+    cycles: int  # number of whole cycles; 0 without a period
+    # Average of the loop's input and displacement_um, phase 0 at the segment's first sample.
     cycle: MeanCycle | None
-    loop: F64
+    loop: F64  # float64[2, m], input and displacement
 
     @classmethod
     def of(cls, samples: Samples, cycles: int, cycle: MeanCycle | None, signals: F64) -> Self:
@@ -47,11 +42,8 @@ class SteadyPart:
 class Overview(Recording):
     """Decimated recording for plots, see :mod:`hilctl.analysis.decimation`.
 
-    The steady parts were computed from all samples.
-
-    Attributes:
-        windows: Evaluated samples of each segment: first, after the last, whole cycles.
-        parts: The steady part of each segment, with its last samples only.
+    Evaluated samples of each segment (first, after the last, whole cycles), and its steady part,
+    which was computed from all samples but has only the last ones.
     """
 
     windows: Mapping[Segment, tuple[int, int, int]] = field(default_factory=dict)

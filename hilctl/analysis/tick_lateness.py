@@ -16,16 +16,11 @@ MOST_EXACT = 2**21
 
 
 class Quantiles:
-    """Distribution of values.
-
-    Attributes:
-        size: Number of values.
-        largest: The largest one; -inf without any.
-    """
+    """Distribution of values."""
 
     def __init__(self) -> None:
-        self.size = 0
-        self.largest = -math.inf
+        self.size = 0  # number of values
+        self.largest = -math.inf  # -inf without any
         self._every = 1
         self._parts: list[Any] = []
 
@@ -57,14 +52,9 @@ _PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9}
 
 
 class LatenessBuilder:
-    """Builder of the lateness of a run.
+    """Lateness of the ticks of a run so far, and the durations of their exchanges.
 
-    Args:
-        minutes: Planned duration of the run; beyond a day, several minutes share a row.
-
-    Attributes:
-        late_ns: Lateness of the ticks so far.
-        exchange_ns: Durations of their exchanges.
+    ``minutes`` is the planned duration of the run; beyond a day, several minutes share a row.
     """
 
     def __init__(self, minutes: float) -> None:

@@ -1,23 +1,29 @@
 """Identify, refine, compare, load and export models."""
 
 from collections.abc import Callable, Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 
 from hilctl.api._types import PathLike, Paths, Settings, path_or_none, paths_of, texts_of
+from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import CommandUnit
 from hilctl.comparison import compare as library
 from hilctl.comparison.compare import Comparison
 from hilctl.experiment.load import inputs_of
-from hilctl.identify.pipeline import Identification, identify_files, settings_from
+from hilctl.identify.data.data_files import load_records
+from hilctl.identify.fit_api import FitRequest
+from hilctl.identify.model_selection import choose_lag
+from hilctl.identify.parallel import workers
+from hilctl.identify.pipeline import Identification, identify_records, settings_from
 from hilctl.identify.refine.acceptance import TOLERANCE_PERCENT
-from hilctl.identify.refine.refinement import Refinement, refine_files
+from hilctl.identify.refine.refinement import Refinement, load_runs, refine_runs
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator
 from hilctl.models.model_export import check_rate, export_text
+from hilctl.models.model_file import dump_model
 from hilctl.models.model_file import load_model as read_model
 from hilctl.run.control.client import finish_dead_runs
 
@@ -52,15 +58,28 @@ def identify(
     Raises:
         InputError: A file or a setting is invalid; nothing is written.
     """
-    return identify_files(
-        paths_of(files),
-        settings_from(model, texts_of(settings)),
-        path_or_none(output),
-        paths_of(validate),
-        scheduler or ("threads" if model == "auto" else "none"),
-        overwrite=overwrite,
-        progress=on_progress,
-    )
+    paths, others = paths_of(files), paths_of(validate)
+    chosen = settings_from(model, texts_of(settings))
+    if output is not None:
+        check_writable(Path(output), overwrite=overwrite, inputs=[*paths, *others])
+    with workers(scheduler or ("threads" if model == "auto" else "none")) as run:
+        lag = chosen.table.lag_samples
+        if chosen.table.find_lag:
+            lag = choose_lag(
+                lambda lag: load_records(paths, chosen, lag).records, chosen, run, on_progress
+            )
+        loaded, unit = load_records(paths, chosen, lag), chosen.table.unit
+        if loaded.unit and unit and loaded.unit != unit:
+            raise InputError(f"--unit must be {loaded.unit}, that of the files: {unit}")
+        held_out = load_records(others, chosen.model_copy(update={"leave_out": ()}), lag).records
+        request = FitRequest(
+            loaded.records, chosen, chosen.unit(loaded.unit), [path.name for path in paths],
+            run, on_progress, validate=held_out,
+        )  # fmt: skip
+        found = identify_records(request)
+    if output is not None and found.verdict.grade != "not a model":
+        write_text(Path(output), dump_model(found.fit.model), overwrite=overwrite)
+    return replace(found, lag_samples=lag, understood=tuple(loaded.understood))
 
 
 @shown_briefly
@@ -179,15 +198,18 @@ def refine(
     Raises:
         InputError: A file is invalid; nothing is written.
     """
-    return refine_files(
-        Path(model),
-        paths_of(runs),
-        path_or_none(output),
-        paths_of(validate),
-        tolerance_percent=tolerance_percent,
-        overwrite=overwrite,
-        progress=on_progress,
+    file, paths, others = Path(model), paths_of(runs), paths_of(validate)
+    if output is not None:
+        check_writable(Path(output), overwrite=overwrite, inputs=[file, *paths, *others])
+    old = read_model(file)
+    on_progress(0.0, "reading")
+    both = load_runs([*paths, *others], old)
+    found = refine_runs(
+        old, both[: len(paths)], both[len(paths) :], file.name, on_progress, tolerance_percent
     )
+    if output is not None and found.better:
+        write_text(Path(output), dump_model(found.model), overwrite=overwrite)
+    return found
 
 
 def compare(

@@ -58,23 +58,16 @@ ppi, and butterfly, which is for rods without a bias."""
 
 @dataclass(frozen=True, slots=True)
 class ComparedModel:
-    """One model of the comparison.
-
-    Attributes:
-        numbers: Number of identified parameters; None for a model file.
-        identify_s: Duration of the identification; None for a model file.
-        inverse_ns: Time per sample of its inverse.
-        trials: Trials of its inverse; none without a simulated device.
-    """
+    """One model of the comparison."""
 
     name: str
     title: str
     model: HysteresisModel
-    numbers: int | None
-    identify_s: float | None
+    numbers: int | None  # number of identified parameters; None for a model file
+    identify_s: float | None  # duration of the identification; None for a model file
     error: Evaluation
-    inverse_ns: float
-    trials: tuple[InverseTrial, ...]
+    inverse_ns: float  # time per sample of its inverse
+    trials: tuple[InverseTrial, ...]  # of its inverse; none without a simulated device
 
     @property
     def compensated_percent(self) -> float | None:
@@ -127,7 +120,7 @@ def _row_mapping(loops: Sequence[SteadyLoop], row: ComparedModel) -> dict[str, A
 
 def compare(
     recordings: Sequence[Path],
-    models: Sequence[str] = (),  # kinds of model, or model files; empty for COMPARED
+    models: Sequence[str] = (),  # empty for COMPARED
     *,
     experiment: Path | None = None,
     settings: Sequence[str] = (),
@@ -138,17 +131,9 @@ def compare(
 ) -> Comparison:
     """Identify each model on the loops, evaluate it, and try its inverse on the device.
 
-    Args:
-        recordings: Recordings of steady loops.
-        models: Kinds of model, or model files; empty for :data:`COMPARED`.
-        experiment: Experiment with device, limits and waveform of the trials; None for device and
-            limits of the first recording and a sine over nearly the complete stroke.
-        settings: ``key=value`` texts over the experiment.
-        frequencies_hz: Frequencies of the trials; None for the lowest, the middle and the highest
-            of the loops with a sine or a triangle, and for the unchanged waveform otherwise.
-        points: Points per loop.
-        clock: Time in s.
-        progress: Called with the part that is done.
+    The arguments are those of :func:`hilctl.api.compare`. Without an experiment, a trial is a sine
+    over nearly the complete stroke. Without frequencies, a waveform other than sine and triangle
+    is unchanged. The clock returns the time in s.
     """
     names = tuple(models) or tuple(COMPARED)
     for name in names:

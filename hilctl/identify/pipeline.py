@@ -1,19 +1,15 @@
-"""Identify a model from files or records, evaluate it, and write it."""
+"""Identify a model from records, and evaluate it."""
 
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
-from pathlib import Path
 from typing import Any
 
-from hilctl.base.errors import InputError
-from hilctl.base.files import check_writable, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document
-from hilctl.identify.data.data_files import load_records
 from hilctl.identify.data.records import History, Record
 from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import FitRequest, OnProgress, ignore_progress
+from hilctl.identify.fit_api import FitRequest
 from hilctl.identify.fit_data import FitData
 from hilctl.identify.fit_model import FittedModel, error_table, fit_model
 from hilctl.identify.model_quality import Verdict, verdict_of
@@ -22,16 +18,13 @@ from hilctl.identify.model_selection import (
     HeldOut,
     OrderScore,
     Selection,
-    choose_lag,
     held_out_error,
     select,
 )
-from hilctl.identify.parallel import workers
 from hilctl.identify.registry import entry
 from hilctl.identify.resonances import WORTH, further_modes
 from hilctl.identify.settings import IdentifySettings
 from hilctl.models.linear_stages import FirstMode, FurtherMode
-from hilctl.models.model_file import dump_model
 
 TURNS = 4  # each identifies a new model
 
@@ -121,49 +114,12 @@ def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
     return document.validate(IdentifySettings)
 
 
-def identify_files(
-    paths: Sequence[Path],  # recordings and text tables
-    settings: IdentifySettings,
-    output: Path | None,  # model file to write
-    validate: Sequence[Path] = (),  # if there are none, parts of the others
-    scheduler: str = "none",  # see :func:`hilctl.identify.parallel.workers`
-    *,
-    overwrite: bool = False,
-    progress: OnProgress = ignore_progress,
-) -> Identification:
-    """Fit a model to files, evaluate it on held-out data, and write it unless it is "not a model".
-
-    Raises:
-        InputError: A file or a setting can't be used; nothing is written.
-    """
-    if output is not None:
-        check_writable(output, overwrite=overwrite, inputs=[*paths, *validate])
-    with workers(scheduler) as run:
-        lag = settings.table.lag_samples
-        if settings.table.find_lag:
-            lag = choose_lag(
-                lambda lag: load_records(paths, settings, lag).records, settings, run, progress
-            )
-        records, recorded, understood = load_records(paths, settings, lag)
-        asked = settings.table.unit
-        if recorded and asked and recorded != asked:
-            raise InputError(f"--unit must be {recorded}, that of the files: {asked}")
-        others = load_records(validate, settings.model_copy(update={"leave_out": ()}), lag).records
-        source = [path.name for path in paths]
-        unit = settings.unit(recorded)
-        request = FitRequest(records, settings, unit, source, run, progress)
-        found = identify_records(request, others)
-    if output is not None and found.verdict.grade != "not a model":
-        write_text(output, dump_model(found.fit.model), overwrite=overwrite)
-    return replace(found, lag_samples=lag, understood=tuple(understood))
-
-
-def identify_records(request: FitRequest, validate: Sequence[Record] = ()) -> Identification:
+def identify_records(request: FitRequest) -> Identification:
     """Fit a model to records, and evaluate it; raise DataError if they can't be used."""
-    records = request.records
+    records, validate = request.records, request.validate
 
     def found(modes: Sequence[FurtherMode]) -> Found:
-        asked = replace(request, modes=modes, validate=validate)
+        asked = replace(request, modes=modes)
         selection = select(asked)
         held_out = selection.held_out
         chosen = replace(asked, settings=selection.settings)

@@ -26,18 +26,13 @@ _HELD = ("command", "slew", "displacement", "tracking error", "measured - comman
 
 @dataclass(frozen=True, slots=True)
 class Gauge:
-    """Use of one limit.
-
-    Attributes:
-        used: Fraction of the limit in use; more than 1 if it is exceeded.
-        unit: Unit of ``value`` and ``limit``.
-    """
+    """Use of one limit."""
 
     name: str
-    used: float
+    used: float  # fraction of the limit in use; more than 1 if it is exceeded
     value: float
     limit: float
-    unit: str
+    unit: str  # of value and limit
 
     @property
     def level(self) -> Literal["info", "warning", "error"]:

@@ -41,17 +41,7 @@ _SEARCH_S = 1.0  # interval of searches for runs
 
 
 class RunReader:
-    """Reader of one active run.
-
-    Attributes:
-        events: Its newest events, the oldest first.
-        signals: Its signals, in the order of their rows.
-        missed: Number of samples not read: dropped by the run, or overwritten too early.
-        ended: Whether the run has ended and no data can follow.
-
-    Raises:
-        RunError: The run has ended, or cannot be read.
-    """
+    """Reader of one active run; raise RunError if it has ended, or cannot be read."""
 
     def __init__(self, folder: RunFolder) -> None:
         self.folder = folder
@@ -62,17 +52,17 @@ class RunReader:
             raise RunError(f"{folder.card.name}: cannot read the run: {error}") from None
         self._page = self._ring.page
         aux = (Signal(each.name, each.name, each.unit) for each in self.description.aux)
-        self.signals = (*SIGNALS, *aux)
+        self.signals = (*SIGNALS, *aux)  # in the order of their rows
         self.scope = self._new_scope([])
         self._aux: list[float] = []
         self._waveform_at = -1
         self._figures = RunningFigures(self.description.sample_rate_hz, self.loop_input)
         self.spectrum = LiveErrorSpectrum(self.description.sample_rate_hz)
         self._lateness, self._headroom = LatenessCounts(), Headroom(self.description)
-        self.events: list[Event] = []
+        self.events: list[Event] = []  # the newest ones, the oldest first
         self._events_seen = 0
-        self.missed = 0
-        self.ended = False
+        self.missed = 0  # samples not read: dropped by the run, or overwritten too early
+        self.ended = False  # whether the run has ended and no data can follow
         self._disk: dict[str, int] | None = None
         self._next_block, self._next_event = max(0, self._page.observe(PageField.HEAD) - 1), 0
         self._next_sample, self._next_note = -1, 0

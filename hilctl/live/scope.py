@@ -37,17 +37,11 @@ ROW = {signal.name: row for row, signal in enumerate(SIGNALS)}
 
 @dataclass(frozen=True, slots=True)
 class Traces:
-    """Signals of n samples in order.
+    """Signals of n samples in order."""
 
-    Attributes:
-        index: int64[n], sample index since the start of the run; a jump is a gap.
-        values: float64[signals, n]; NaN if there is no value.
-        flags: uint32[n], bits of :class:`hilctl.base.samples.Flag`.
-    """
-
-    index: I64
-    values: F64
-    flags: U32
+    index: I64  # int64[n], sample index since the start of the run; a jump is a gap
+    values: F64  # float64[signals, n]; NaN if there is no value
+    flags: U32  # uint32[n], bits of :class:`hilctl.base.samples.Flag`
 
     def rows(self, chosen: slice) -> "Traces":
         """Return the selected samples."""

@@ -2,9 +2,9 @@
 
 from pathlib import Path
 
+from hilctl import api
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.identify.refine.refinement import refine_files
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment
 from hilctl.run.unpaced import run_unpaced
@@ -33,7 +33,7 @@ def test_compensated_runs_make_a_model_better_on_another_reference(tmp_path):
         for i, (frequency_hz, size) in enumerate(given)
     ]
     better = tmp_path / "better.yaml"
-    assert refine_files(STAGED, runs, better).better
+    assert api.refine(STAGED, runs, better).better
     was, now = (
         summarize(read(run(tmp_path / f"{name}.mcap", model, 90.0, 28.0, seed=40)))
         for name, model in (("was", STAGED), ("now", better))
@@ -52,11 +52,11 @@ def test_model_of_full_strokes_improves_on_small_references(tmp_path):
         for i, reference in enumerate(given)
     ]
     better = tmp_path / "better.yaml"
-    refused = refine_files(OMEGA, runs, better)
+    refused = api.refine(OMEGA, runs, better)
     assert refused.worse  # a full stroke, whose peak rises
     assert not refused.better
     assert not better.exists()
-    found = refine_files(OMEGA, runs, better, tolerance_percent=0.5)
+    found = api.refine(OMEGA, runs, better, tolerance_percent=0.5)
     assert found.better
 
     unseen = ((110.0, 36.0), (15.0, 19.0), (90.0, 9.0), (50.0, 4.0))

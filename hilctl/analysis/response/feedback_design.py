@@ -44,17 +44,12 @@ _GAINS = {"bandwidth_hz", "kp", "ki_per_s", "resonance_hz", "damping_ratio", "re
 
 @dataclass(frozen=True, slots=True)
 class LoopMargins:
-    """Figures of an open loop.
+    """Figures of an open loop."""
 
-    Attributes:
-        crossover_hz: Lowest frequency at which its gain is 1.
-        peak_sensitivity: Largest factor by which the loop amplifies a disturbance.
-    """
-
-    crossover_hz: float
+    crossover_hz: float  # lowest frequency at which its gain is 1
     gain_margin_db: float
     phase_margin_deg: float
-    peak_sensitivity: float
+    peak_sensitivity: float  # largest factor by which the loop amplifies a disturbance
 
     @classmethod
     def of(cls, loop: LoopResponse) -> "LoopMargins":

@@ -38,53 +38,32 @@ _NM = 1e3  # per um
 
 @dataclass(frozen=True, slots=True)
 class RestNoise:
-    """Sensor signal at rest.
-
-    Attributes:
-        noise_um: rms about the linear trend.
-        peak_um: Largest deviation from the linear trend.
-        span_um: Range of the readings.
-        drift_um_per_s: Slope of the linear trend.
-        line_hz: Frequency of the strongest spectral line.
-        line_um: Its amplitude.
-        bias_instability_um: Lowest Allan deviation over 0.664; an upper bound if the deviation
-            still falls at the longest time.
-        bias_time_s: Averaging time of the lowest Allan deviation.
-        averaging_s: float64[m], averaging times.
-        allan_um: float64[m], overlapping Allan deviation of means over each time.
-    """
+    """Sensor signal at rest."""
 
     mean_um: float
-    noise_um: float
-    peak_um: float
-    span_um: float
-    drift_um_per_s: float
-    line_hz: float
-    line_um: float
+    noise_um: float  # rms about the linear trend
+    peak_um: float  # largest deviation from the linear trend
+    span_um: float  # range of the readings
+    drift_um_per_s: float  # slope of the linear trend
+    line_hz: float  # frequency of the strongest spectral line
+    line_um: float  # its amplitude
+    # Lowest Allan deviation over 0.664; an upper bound if it still falls at the longest time.
     bias_instability_um: float
-    bias_time_s: float
-    averaging_s: F64
-    allan_um: F64
+    bias_time_s: float  # averaging time of the lowest Allan deviation
+    averaging_s: F64  # float64[m], averaging times
+    allan_um: F64  # float64[m], overlapping Allan deviation of means over each time
 
 
 @dataclass(frozen=True, slots=True)
 class SineHarmonics:
-    """Harmonics of the displacement in the steady cycles of a sine.
-
-    Attributes:
-        harmonics_um: float64[h], amplitudes at 1, 2, ... times the frequency.
-        noise_um: float64[h], their standard errors, from the scatter of the cycles.
-        thd_percent: Total harmonic distortion: root of the sum of squares of the harmonics from the
-            second on, of the first.
-        thd_noise_percent: Distortion that the noise alone would cause.
-    """
+    """Harmonics of the displacement in the steady cycles of a sine."""
 
     frequency_hz: float
     cycles: int
-    harmonics_um: F64
-    noise_um: F64
-    thd_percent: float
-    thd_noise_percent: float
+    harmonics_um: F64  # float64[h], amplitudes at 1, 2, ... times the frequency
+    noise_um: F64  # float64[h], their standard errors, from the scatter of the cycles
+    thd_percent: float  # root of the sum of squares of the further harmonics, of the first
+    thd_noise_percent: float  # distortion that the noise alone would cause
 
 
 @shown_briefly

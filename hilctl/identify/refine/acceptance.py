@@ -78,13 +78,11 @@ def worst_class(classes: Sequence[ErrorChange]) -> ErrorChange:
 class AcceptanceRule:
     """Rule by which a refined model replaces the old one.
 
-    Attributes:
-        range_um: Range of the model, by which runs are classified.
-        tolerance_percent: Increase of a run's rms error to accept, in percent of its peak-to-peak;
-            three times that for its peak error. A tenth of its old error is always accepted.
+    A run's rms error may increase by a tolerance in percent of its peak-to-peak, its peak error by
+    three times that. A tenth of its old error is always accepted.
     """
 
-    range_um: float
+    range_um: float  # range of the model, by which runs are classified
     tolerance_percent: float = TOLERANCE_PERCENT
 
     def __post_init__(self) -> None:

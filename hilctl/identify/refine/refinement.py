@@ -12,7 +12,6 @@ from typing import Any
 import numpy as np
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.files import check_writable, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.samples import Flag
 from hilctl.identify.data.data_faults import data_reasons
@@ -32,7 +31,6 @@ from hilctl.identify.refine.acceptance import (
 )
 from hilctl.identify.refine.residual_fit import ResidualFit
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
-from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.refined import RefinedModel
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
@@ -318,33 +316,6 @@ class Refinement:
             "before": self.choice.before.to_mapping(),
             "after": self.choice.after.to_mapping(),
         }
-
-
-def refine_files(
-    model: Path,
-    paths: Sequence[Path],  # recordings of runs, compensated or not
-    output: Path | None,  # model file to write
-    validate: Sequence[Path] = (),  # if there are none, those of ``paths`` in turn
-    *,
-    tolerance_percent: float = TOLERANCE_PERCENT,
-    overwrite: bool = False,
-    progress: OnProgress = ignore_progress,
-) -> Refinement:
-    """Refine a model from recordings, and write it if it is better.
-
-    Raises:
-        InputError: A file can't be used; nothing is written.
-    """
-    if output is not None:
-        check_writable(output, overwrite=overwrite, inputs=[model, *paths, *validate])
-    old = load_model(model)
-    progress(0.0, "reading")
-    both = load_runs([*paths, *validate], old)
-    runs, others = both[: len(paths)], both[len(paths) :]
-    found = refine_runs(old, runs, others, model.name, progress, tolerance_percent)
-    if output is not None and found.better:
-        write_text(output, dump_model(found.model), overwrite=overwrite)
-    return found
 
 
 def refine_runs(

@@ -1,5 +1,7 @@
 """Identify, refine and compare models from Python."""
 
+from contextlib import contextmanager
+
 import numpy as np
 import pytest
 
@@ -36,17 +38,10 @@ def test_a_model_is_identified_and_written(table, tmp_path):
 
 def test_arguments_are_passed_on(monkeypatch):
     seen = {}
-    monkeypatch.setattr("hilctl.api.models.refine_files", lambda *given, **named: (given, named))
     monkeypatch.setattr(
         "hilctl.comparison.compare.compare",
         lambda paths, models, **named: seen.update(named, paths=paths, models=models),
     )
-    given, named = api.refine("m.yaml", ["a.mcap", "b.mcap"], validate="c.mcap", overwrite=True)
-    assert [str(path) for path in (given[0], *given[1], *given[3])] == [
-        "m.yaml", "a.mcap", "b.mcap", "c.mcap",
-    ]  # fmt: skip
-    assert given[2] is None
-    assert named["overwrite"]
     api.compare("a.mcap", ["ppi"], settings={"block": 5}, frequencies_hz=[1.0])
     assert [str(path) for path in seen["paths"]] == ["a.mcap"]
     assert (seen["models"], seen["settings"], seen["points"]) == (["ppi"], ["block=5"], 300)
@@ -57,8 +52,18 @@ def test_arguments_are_passed_on(monkeypatch):
     [("auto", None, "threads"), ("ppi", None, "none"), ("ppi", "processes", "processes")],
 )
 def test_default_scheduler(monkeypatch, model, asked, where):
-    monkeypatch.setattr("hilctl.api.models.identify_files", lambda *given, **named: given[4])
-    assert api.identify("a.mcap", model=model, scheduler=asked) == where
+    chosen = []
+
+    @contextmanager
+    def workers(scheduler):
+        chosen.append(scheduler)
+        raise InputError(scheduler)
+        yield
+
+    monkeypatch.setattr("hilctl.api.models.workers", workers)
+    with pytest.raises(InputError):
+        api.identify("a.mcap", model=model, scheduler=asked)
+    assert chosen == [where]
 
 
 @pytest.fixture

@@ -23,7 +23,9 @@ def grid(loop_of):
 
 def judged(records, validate=(), **choices):
     chosen = {"plays": 2, "starts": 1, "weights": "free", **choices}
-    return identify_records(FitRequest(records, FitSettings(kind="ppi", **chosen), "A"), validate)
+    return identify_records(
+        FitRequest(records, FitSettings(kind="ppi", **chosen), validate=validate)
+    )
 
 
 def changed(records, change):

@@ -10,15 +10,16 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilctl import api
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.cli.models import print_identification
 from hilctl.identify import pipeline as subject
 from hilctl.identify.data.records import History, SteadyLoop
 from hilctl.identify.model_page import identification_page
 from hilctl.identify.model_selection import Selection
-from hilctl.identify.pipeline import TURNS, identify_files, settings_from, with_modes
+from hilctl.identify.pipeline import TURNS, settings_from, with_modes
 from hilctl.identify.resonances import WORTH
-from hilctl.identify.settings import FitSettings, IdentifySettings
+from hilctl.identify.settings import FitSettings
 from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.models.model_file import load_model
 from hilctl.models.plays import PpiModel
@@ -47,16 +48,14 @@ TABLE = ("table.unit=V", "table.command_column=drive", "table.displacement_colum
          "table.rate_hz=200", "table.ignore=10", "whole=true")  # fmt: skip
 
 
-def settings(*texts: str) -> IdentifySettings:
-    return settings_from("ppi", [*TABLE, "weights=free", "offset=true", *texts])
-
-
 @pytest.mark.slow
 @pytest.mark.usefixtures("undrawn")
 def test_order_and_lag_are_found_and_reported(tables, tmp_path, capsys):
     output = tmp_path / "model.yaml"
-    asked = settings("plays=auto", "table.lag_samples=auto")
-    found = identify_files(tables, asked, output, validate=tables[:1], scheduler="threads")
+    asked = [*TABLE, "weights=free", "offset=true", "plays=auto", "table.lag_samples=auto"]
+    found = api.identify(
+        tables, output, model="ppi", settings=asked, validate=tables[:1], scheduler="threads"
+    )
     assert found.lag_samples == 2
     assert found.fit.peak_percent < 2.0
     model = load_model(output)
@@ -73,13 +72,13 @@ def test_order_and_lag_are_found_and_reported(tables, tmp_path, capsys):
     assert "sine3.csv" in text
     assert "<script" not in text
     with pytest.raises(InputError, match="exists already"):
-        identify_files(tables, asked, output)
+        api.identify(tables, output, model="ppi", settings=asked)
 
 
 def test_a_unit_that_was_not_recorded_is_refused():
     golden = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
     with pytest.raises(InputError, match="--unit must be A"):
-        identify_files([golden], settings_from("straight", ["table.unit=V"]), None)
+        api.identify(golden, model="straight", settings=["table.unit=V"])
 
 
 def test_settings_are_checked_together():

@@ -7,6 +7,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl import api
 from hilctl.base.errors import DataError, InputError
 from hilctl.identify.evaluation import judgement_of
 from hilctl.identify.fit_data import FitData
@@ -131,7 +132,7 @@ def test_a_file_that_exists_is_refused_before_anything_is_read(tmp_path):
     output = tmp_path / "better.yaml"
     output.write_text("mine")
     with pytest.raises(InputError, match=r"better\.yaml"):
-        refinement.refine_files(tmp_path / "none.yaml", [], output)
+        api.refine(tmp_path / "none.yaml", [], output)
     assert output.read_text() == "mine"
 
 
