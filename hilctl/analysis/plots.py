@@ -4,8 +4,8 @@
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass
 from functools import partial
+from typing import NamedTuple
 
 import matplotlib as mpl
 import numpy as np
@@ -59,8 +59,7 @@ _LARGEST_UM = 1e100  # larger readings have no spectrum
 _WIDEST_GAP = 0.02  # share of samples that may be missing
 
 
-@dataclass(frozen=True, slots=True)
-class ErrorSpectrum:
+class ErrorSpectrum(NamedTuple):
     """Spectrum of the error over steady samples."""
 
     frequency_hz: F64  # float64[k], > 0
@@ -98,44 +97,40 @@ def _even(index: I64, values: F64) -> tuple[I64, F64, F64] | None:
 
 def time_history(recording: Recording) -> FigureSpec | None:
     """Return reference, displacement and command over the whole run; None without samples."""
-    if recording.samples.index.size == 0:
-        return None
-    panels = (
-        Panel(partial(_draw_history, recording=recording)),
-        Panel(partial(_draw_command, recording=recording), height=_LOW),
-    )
-    caption = "Whole run: displacement, reference and command; grey: the evaluated part."
-    return FigureSpec("history", caption, panels, stacked=True)
-
-
-def _draw_history(axes: Axes, recording: Recording) -> None:
     samples = recording.samples
-    draw_over_time(axes, recording, samples.displacement_um, DISPLACEMENT, "displacement")
-    draw_over_time(axes, recording, samples.reference_um, REFERENCE, "reference", outline=True)
-    axes.set(xlabel="time, s", ylabel="displacement, µm")
-    _mark_judged(axes, recording)
+    if samples.index.size == 0:
+        return None
 
+    def moved(axes: Axes) -> None:
+        draw_over_time(axes, recording, samples.displacement_um, DISPLACEMENT, "displacement")
+        draw_over_time(axes, recording, samples.reference_um, REFERENCE, "reference", outline=True)
+        axes.set(xlabel="time, s", ylabel="displacement, µm")
+        _mark_judged(axes, recording)
 
-def _draw_command(axes: Axes, recording: Recording) -> None:
-    draw_over_time(axes, recording, recording.samples.command, COMMAND, "command")
-    axes.set(xlabel="time, s", ylabel=f"command, {recording.command_unit}")
-    _mark_judged(axes, recording)
+    def commanded(axes: Axes) -> None:
+        draw_over_time(axes, recording, samples.command, COMMAND, "command")
+        axes.set(xlabel="time, s", ylabel=f"command, {recording.command_unit}")
+        _mark_judged(axes, recording)
+
+    caption = "Whole run: displacement, reference and command; grey: the evaluated part."
+    panels = Panel(moved), Panel(commanded, height=_LOW)
+    return FigureSpec("history", caption, panels, stacked=True)
 
 
 def auxiliary(recording: Recording) -> FigureSpec | None:
     """Return the auxiliary channels over the run, a panel per unit; None without any."""
-    units = dict.fromkeys(each.unit for each in recording.aux_channels)
-    panels = [Panel(partial(_draw_aux, recording=recording, unit=unit), "", _LOW) for unit in units]
-    caption = "Auxiliary channels over the whole run."
-    return FigureSpec("auxiliary", caption, tuple(panels), stacked=True) if units else None
-
-
-def _draw_aux(axes: Axes, recording: Recording, unit: str) -> None:
     t = recording.samples.index / recording.sample_rate_hz
-    shown = [each.name for each in recording.aux_channels if each.unit == unit]
-    for k, name in enumerate(shown):
-        draw_line(axes, t, recording.aux[name], _INKS[k % len(_INKS)], name)
-    axes.set(xlabel="time, s", ylabel=f"auxiliary, {unit}" if unit else "auxiliary")
+
+    def draw(axes: Axes, unit: str) -> None:
+        shown = [each.name for each in recording.aux_channels if each.unit == unit]
+        for k, name in enumerate(shown):
+            draw_line(axes, t, recording.aux[name], _INKS[k % len(_INKS)], name)
+        axes.set(xlabel="time, s", ylabel=f"auxiliary, {unit}" if unit else "auxiliary")
+
+    units = dict.fromkeys(each.unit for each in recording.aux_channels)
+    panels = tuple(Panel(partial(draw, unit=unit), height=_LOW) for unit in units)
+    caption = "Auxiliary channels over the whole run."
+    return FigureSpec("auxiliary", caption, panels, stacked=True) if units else None
 
 
 def steady_cycles(recording: Recording, focus: int = 0) -> FigureSpec | None:
@@ -275,29 +270,28 @@ def spectrum(recording: Recording, focus: int = 0) -> FigureSpec | None:
     found = error_spectrum(recording, segment, samples.index, error_um)
     if found is None:
         return None
-    panels = [Panel(partial(_draw_spectrum, found=found), "spectrum")]
-    caption = "Spectrum of the error."
-    if found.harmonics_um.size:
-        caption = "Spectrum of the error, and its harmonics in the average cycle."
-        panels.append(Panel(partial(_draw_harmonics, found=found), "harmonics", 0.5))
-    return FigureSpec("error_spectrum", caption, tuple(panels))
+    hz, amplitude_um, harmonics_um = found
 
+    def draw(axes: Axes) -> None:
+        x, _, y = in_bands(hz, amplitude_um, _SPECTRUM_POINTS)
+        axes.loglog(x, np.maximum(1e3 * y, 1e-12), color=ERROR, linewidth=0.8)
+        highest = 1e3 * float(y.max())
+        if highest > 0.0:
+            axes.set_ylim(max(1e3 * float(y.min()), highest * 10.0**-_DECADES), 2.0 * highest)
+        axes.set(xlabel="frequency, Hz", ylabel="amplitude, nm", xlim=(x[0], x[-1]))
+        plain_numbers(axes)
 
-def _draw_spectrum(axes: Axes, found: ErrorSpectrum) -> None:
-    x, _, y = in_bands(found.frequency_hz, found.amplitude_um, _SPECTRUM_POINTS)
-    axes.loglog(x, np.maximum(1e3 * y, 1e-12), color=ERROR, linewidth=0.8)
-    highest = 1e3 * float(y.max())
-    if highest > 0.0:
-        axes.set_ylim(max(1e3 * float(y.min()), highest * 10.0**-_DECADES), 2.0 * highest)
-    axes.set(xlabel="frequency, Hz", ylabel="amplitude, nm", xlim=(x[0], x[-1]))
-    plain_numbers(axes)
+    def draw_harmonics(axes: Axes) -> None:
+        order = np.arange(1, harmonics_um.size + 1)
+        axes.bar(order, 1e3 * harmonics_um, color=ERROR, width=0.7)
+        axes.set(xlabel="harmonic of the waveform's frequency", ylabel="amplitude, nm")
+        axes.set_xticks([1, *range(5, int(order[-1]) + 1, 5)])
 
-
-def _draw_harmonics(axes: Axes, found: ErrorSpectrum) -> None:
-    order = np.arange(1, found.harmonics_um.size + 1)
-    axes.bar(order, 1e3 * found.harmonics_um, color=ERROR, width=0.7)
-    axes.set(xlabel="harmonic of the waveform's frequency", ylabel="amplitude, nm")
-    axes.set_xticks([1, *range(5, int(order[-1]) + 1, 5)])
+    if not harmonics_um.size:
+        return FigureSpec("error_spectrum", "Spectrum of the error.", (Panel(draw, "spectrum"),))
+    panels = Panel(draw, "spectrum"), Panel(draw_harmonics, "harmonics", 0.5)
+    caption = "Spectrum of the error, and its harmonics in the average cycle."
+    return FigureSpec("error_spectrum", caption, panels)
 
 
 def response(recording: Recording, focus: int = 0) -> FigureSpec | None:
@@ -314,35 +308,31 @@ def response(recording: Recording, focus: int = 0) -> FigureSpec | None:
 
 def lateness(recording: Recording) -> FigureSpec | None:
     """Return histograms of lateness and exchanges; None without ticks in real time."""
-    if recording.ticks.late_ns.size == 0 or recording.run.get("paced") == "false":
-        return None
-    caption = "Lateness of ticks, and duration of exchanges with the device."
-    return FigureSpec("lateness", caption, (Panel(partial(_draw_lateness, recording=recording)),))
-
-
-def _draw_lateness(axes: Axes, recording: Recording) -> None:
     ticks = recording.ticks
-    late_us, exchange_us = _microseconds(ticks.late_ns), _microseconds(ticks.exchange_ns)
-    everything = np.concatenate((late_us, exchange_us))
-    highest = max(float(everything.max()) * 1.05, float(everything.min()) * 2.0)
-    bins = np.geomspace(float(everything.min()), highest, _BINS).tolist()
-    axes.hist(late_us, bins, color=DISPLACEMENT, alpha=0.6, label="lateness")
-    axes.hist(exchange_us, bins, histtype="step", color=COMMAND, label="exchange")
-    quantiles = Quantiles()
-    quantiles.add(ticks.late_ns)
-    marks = tick_lateness.percentiles_us(quantiles)
-    for name in ("p50", "p99", "max"):
-        _mark(axes, max(marks[name], 1.0), f"{name} {quantity(marks[name], 'us')}")
-    period_ns = tick_lateness.tick_period_ns(ticks)
-    if period_ns is not None and period_ns * 0.5e-3 < bins[-1]:
-        axes.axvline(period_ns * 0.5e-3, color=MARK, linewidth=1.4, label="half a tick period")
-    axes.set(xscale="log", yscale="log", xlabel="time, µs (below 1 µs counts as 1)", ylabel="ticks")
-    plain_numbers(axes)
+    if ticks.late_ns.size == 0 or recording.run.get("paced") == "false":
+        return None
 
+    def draw(axes: Axes) -> None:
+        times_us = np.maximum(1e-3 * np.array((ticks.late_ns, ticks.exchange_ns)), 1.0)
+        lowest = float(times_us.min())
+        highest = max(float(times_us.max()) * 1.05, lowest * 2.0)
+        bins = np.geomspace(lowest, highest, _BINS).tolist()
+        axes.hist(times_us[0], bins, color=DISPLACEMENT, alpha=0.6, label="lateness")
+        axes.hist(times_us[1], bins, histtype="step", color=COMMAND, label="exchange")
+        quantiles = Quantiles()
+        quantiles.add(ticks.late_ns)
+        marks = tick_lateness.percentiles_us(quantiles)
+        for name in ("p50", "p99", "max"):
+            _mark(axes, max(marks[name], 1.0), f"{name} {quantity(marks[name], 'us')}")
+        period_ns = tick_lateness.tick_period_ns(ticks)
+        if period_ns is not None and period_ns * 0.5e-3 < bins[-1]:
+            axes.axvline(period_ns * 0.5e-3, color=MARK, linewidth=1.4, label="half a tick period")
+        name = "time, µs (below 1 µs counts as 1)"
+        axes.set(xscale="log", yscale="log", xlabel=name, ylabel="ticks")
+        plain_numbers(axes)
 
-def _microseconds(times_ns: I64) -> F64:
-    times_us: F64 = np.maximum(times_ns * 1e-3, 1.0)
-    return times_us
+    caption = "Lateness of ticks, and duration of exchanges with the device."
+    return FigureSpec("lateness", caption, (Panel(draw),))
 
 
 def _mark(axes: Axes, x: float, text: str) -> None:

@@ -173,6 +173,9 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
     loop_input = "reference" if report.compensated else "command (no compensator)"
     reason = printable(report.reason) or MISSING
     labels = ", ".join(f"{key} {value}" for key, value in report.labels.items())
+    zero = f"{quantity(report.zero_um, 'um', 4)} subtracted from the readings"
+    oldest = quantity(report.reading_age_max_s, "s")
+    age = f"at most {oldest}; {report.lost_readings:,} readings lost"
     return [
         *([("labels", printable(labels))] if labels else []),
         ("device", f"{printable(report.device) or MISSING}{simulated}"),
@@ -187,8 +190,8 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         *((name, _aux(each)) for name, each in report.aux.items()),
         ("limited samples", f"{report.limited_samples:,}"),
         ("invalid readings", f"{report.sensor_invalid_samples:,}"),
-        *([("sensor zero", _zero(report))] if report.zero_um is not None else []),
-        *([("reading age", _age(report))] if report.reading_age_max_s is not None else []),
+        *([("sensor zero", zero)] if report.zero_um is not None else []),
+        *([("reading age", age)] if report.reading_age_max_s is not None else []),
         ("ticks", f"{_count(report.late_ticks)} late, {_count(report.skipped_ticks)} skipped"),
         *([("timing", report.deadline_misses)] if report.deadline_misses else []),
         *([("adapted", adapted_text(report.adapted))] if report.adapted else []),
@@ -203,15 +206,6 @@ def _aux(found: AuxReport) -> str:
     mean = f", mean {number(found.mean, found.unit)}" if found.mean is not None else ""
     meaning = f" ({found.meaning})" if found.meaning else ""
     return printable(f"{_range(found.min, found.max, found.unit)}{mean}{meaning}")
-
-
-def _zero(report: RunReport) -> str:
-    return f"{quantity(report.zero_um, 'um', 4)} subtracted from the readings"
-
-
-def _age(report: RunReport) -> str:
-    oldest = quantity(report.reading_age_max_s or 0.0, "s")
-    return f"at most {oldest}; {report.lost_readings:,} readings lost"
 
 
 def usage_text(usage: ProcessUsage) -> str:

@@ -3,7 +3,6 @@
 import json
 from collections.abc import Iterator, Mapping, Sequence
 from datetime import datetime
-from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -29,19 +28,9 @@ _NOT_SHOWN = {"waveform.kind", "waveform.unit"}
 _USUAL = {"0.0", "None", ""}
 
 
-def write_html(
-    recording: Recording, report: RunReport, path: Path, before: Recording | None = None
-) -> None:
-    """Write the page of a run over an existing file; raise InputError if it cannot be written.
-
-    ``before`` is the same motion without a compensator, for comparison.
-    """
-    html.write_page(page(recording, report, before), path)
-
-
 @np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
 def page(recording: Recording, report: RunReport, before: Recording | None = None) -> str:
-    """Return the page of a run as HTML."""
+    """Return the page of a run as HTML; ``before`` is the same motion without a compensator."""
     terms = ["average cycle"] if report.steady_cycles else []
     if report.peak_hysteresis_percent is not None:
         terms += ["peak hysteresis", "noise floor", "loop area"]

@@ -50,12 +50,6 @@ class Overview(Recording):
     parts: Mapping[Segment, SteadyPart] = field(default_factory=dict)
 
 
-def waveform_end(samples: Samples) -> int:
-    """Return the index after the last sample of the waveform; 0 without any."""
-    waveform = samples.index[(samples.flags & NO_WAVEFORM) == 0]
-    return int(waveform[-1]) + 1 if waveform.size else 0
-
-
 def judged(segment: Segment, events: Iterable[Event], end: int) -> tuple[int, int, int]:
     """Return the evaluated samples of a segment: first, after the last, and whole cycles.
 
@@ -79,7 +73,9 @@ def steady_samples(recording: Recording, segment: Segment) -> tuple[Samples, int
     if isinstance(recording, Overview):
         start, stop, cycles = recording.windows[segment]
     else:
-        start, stop, cycles = judged(segment, recording.events, waveform_end(recording.samples))
+        waveform = recording.samples.index[(recording.samples.flags & NO_WAVEFORM) == 0]
+        end = int(waveform[-1]) + 1 if waveform.size else 0
+        start, stop, cycles = judged(segment, recording.events, end)
     return trusted(recording.samples.part(start, stop)), cycles
 
 

@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hilctl.api._types import PathLike, Settings, path_or_none, runs_folder, texts_of
 from hilctl.base.errors import InputError
-from hilctl.base.files import check_no_input, check_writable
+from hilctl.base.files import check_no_input, check_writable, write_text
 from hilctl.base.table import Column
 from hilctl.experiment.correction import write_correction
 from hilctl.experiment.load import inputs_of
@@ -40,7 +40,7 @@ from hilctl.studies.characterise.characterisation_runner import (
     CharacterisationRunner,
 )
 from hilctl.studies.characterise.results import Characterisation, StepRow
-from hilctl.studies.characterise.rig_page import write_characterisation
+from hilctl.studies.characterise.rig_page import characterisation_page
 from hilctl.studies.step_runner import StudyHost
 
 
@@ -179,12 +179,12 @@ def characterise(
     if overwrite:
         measured.discard()
     found = measured.characterise(file, overwrite=overwrite)
-    write_characterisation(found, page)
+    write_text(page, characterisation_page(found), overwrite=True)
     return found
 
 
 def campaign(
-    file: PathLike,
+    file: PathLike | CampaignSteps,
     folder: PathLike | None = None,
     *,
     settings: Settings = (),
@@ -199,7 +199,7 @@ def campaign(
     """Run an experiment with each combination of varied keys; a stopped campaign resumes.
 
     Args:
-        file: Campaign file (YAML).
+        file: Campaign file (YAML), or its steps.
         folder: Folder for recordings, table and page; default: named after the campaign.
         settings: Overrides of the experiment of every step.
         fast: Simulate without waiting; simulated devices only.
@@ -217,12 +217,26 @@ def campaign(
         InputError: An input is invalid; nothing has moved.
         RunError: A hazard to device or rig ended the campaign; completed steps are kept.
     """
+    steps = file
+    if not isinstance(steps, CampaignSteps):
+        steps = load_campaign(Path(steps), texts_of(settings))
+    if scheduler != "none" and not fast:
+        raise InputError("scheduler needs fast: runs in real time are sequential")
     host = StudyHost(on_progress=on_progress, on_step=on_row, on_note=on_note)
-    steps = load_campaign(Path(file), texts_of(settings))
-    return run_steps(
-        steps, path_or_none(folder), host,
-        fast=fast, scheduler=scheduler, dry_run=dry_run, on_plan=on_plan,
-    )  # fmt: skip
+    chosen = path_or_none(folder) or campaign_folder(steps)
+    with nullcontext() if dry_run else prepared(chosen, host):
+        host.on_progress(0.0, "check every step")
+        if fast:
+            plan = planned_fast(steps, chosen)
+        else:
+            plan = planned_in_real_time(steps, chosen, host.now_s())
+        inputs = inputs_of(steps.experiment, steps.settings)
+        for suffix in (".csv", ".parquet", ".html"):
+            check_no_input(chosen / f"{steps.config.name}{suffix}", inputs)
+        on_plan(plan)
+        if dry_run:
+            return None
+        return run_fast(plan, host, scheduler) if fast else run_series(plan, host)
 
 
 def learn(
@@ -262,32 +276,3 @@ def learn(
     learned = session.learn(cycles, on_rows)
     write_correction(file, learned.correction, overwrite=overwrite)
     return learned
-
-
-def run_steps(
-    steps: CampaignSteps,
-    folder: Path | None,
-    host: StudyHost,
-    *,
-    fast: bool,
-    scheduler: str,
-    dry_run: bool,
-    on_plan: Callable[[CampaignPlan], None],
-) -> CampaignResult | None:
-    """Run the steps of a campaign file or a sweep; see :func:`campaign`."""
-    if scheduler != "none" and not fast:
-        raise InputError("scheduler needs fast: runs in real time are sequential")
-    chosen = folder or campaign_folder(steps)
-    with nullcontext() if dry_run else prepared(chosen, host):
-        host.on_progress(0.0, "check every step")
-        if fast:
-            plan = planned_fast(steps, chosen)
-        else:
-            plan = planned_in_real_time(steps, chosen, host.now_s())
-        inputs = inputs_of(steps.experiment, steps.settings)
-        for suffix in (".csv", ".parquet", ".html"):
-            check_no_input(chosen / f"{steps.config.name}{suffix}", inputs)
-        on_plan(plan)
-        if dry_run:
-            return None
-        return run_fast(plan, host, scheduler) if fast else run_series(plan, host)

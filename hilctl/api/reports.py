@@ -26,11 +26,11 @@ from hilctl.analysis.response.segment_spectrum import SegmentSpectrum, spectra, 
 from hilctl.analysis.response.step_response import SETTLED_PERCENT, StepResponse
 from hilctl.analysis.response.step_response import step_response as measured_step
 from hilctl.analysis.run_metrics import RunReport
-from hilctl.analysis.run_page import run_sheets, write_html
+from hilctl.analysis.run_page import page, run_sheets
 from hilctl.api._types import PathLike, Paths, paths_of
 from hilctl.api.recordings import RecordedRun, read, recording_of, stream_of
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.files import check_writable
+from hilctl.base.files import check_writable, write_text
 from hilctl.experiment.open_loop import write_response
 from hilctl.models.model_file import load_model
 from hilctl.run.control.client import finish_dead_runs
@@ -64,11 +64,10 @@ def report_page(
         InputError: A file does not exist, or the page cannot be written.
         DataError: A file is not a recording.
     """
-    page = Path(html)
-    check_writable(page, overwrite=overwrite)
+    check_writable(Path(html), overwrite=overwrite)
     earlier = overview(stream_of(before))[1] if before is not None else None
     summary, shown = overview(stream_of(run, from_s, to_s))
-    write_html(shown, summary, page, earlier)
+    write_text(Path(html), page(shown, summary, earlier), overwrite=True)
     return summary
 
 

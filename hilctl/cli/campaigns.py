@@ -5,8 +5,7 @@ import shlex
 import signal
 import sys
 from collections.abc import Hashable, Sequence
-from dataclasses import asdict, replace
-from functools import partial
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -15,7 +14,6 @@ from rich.table import Table
 
 from hilctl import api
 from hilctl.api._types import runs_folder
-from hilctl.api.campaigns import run_steps
 from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.yaml import Document
 from hilctl.cli.console import print_rich, progress_bar, table
@@ -52,7 +50,6 @@ from hilctl.studies.multi_run.varied_parameter import (
     short_value,
     texts_of,
 )
-from hilctl.studies.step_runner import StudyHost
 
 _RESUMES = "the same command resumes from there"
 Folder = Annotated[
@@ -135,7 +132,7 @@ def _run_campaign(
     dry_run: bool,
     as_json: bool,
 ) -> None:
-    varied = varied_by(steps)
+    varied = dimensions(steps.keys, [_values(step) for step in steps.steps])
 
     def on_plan(plan: CampaignPlan) -> None:
         if not as_json:
@@ -143,13 +140,15 @@ def _run_campaign(
         elif dry_run:
             print_json(plan_mapping(plan))
 
+    def on_row(step: CampaignStep, row: CampaignRow) -> None:
+        if not as_json:
+            print_row(varied, step, row)
+
     with progress_bar("campaign", quiet=as_json) as on_progress:
-        host = StudyHost(on_progress=on_progress, on_note=_note)
-        host = host if as_json else replace(host, on_step=partial(print_row, varied))
         try:
-            result = run_steps(
-                steps, folder, host,
-                fast=fast, scheduler=scheduler, dry_run=dry_run, on_plan=on_plan,
+            result = api.campaign(
+                steps, folder, fast=fast, scheduler=scheduler, dry_run=dry_run,
+                on_progress=on_progress, on_plan=on_plan, on_row=on_row, on_note=_note,
             )  # fmt: skip
         except KeyboardInterrupt:  # between two runs, or while the coil cools
             text = f"stopped by Ctrl-C between two steps; {_RESUMES}"
@@ -197,11 +196,6 @@ def plan_mapping(plan: CampaignPlan) -> dict[str, Any]:
         "recordings_mb": plan.megabytes,
         "free_mb": plan.free_mb,
     }
-
-
-def varied_by(steps: CampaignSteps) -> tuple[VariedParameter, ...]:
-    """Return the varied parameters of a campaign, without those that depend on others."""
-    return dimensions(steps.keys, [_values(step) for step in steps.steps])
 
 
 def _values(step: CampaignStep) -> dict[str, Hashable]:

@@ -19,7 +19,7 @@ from hilctl.loop.interlocks import InterlockContext, InterlockSettings
 from hilctl.models.base import HysteresisModel
 from hilctl.run.assemble import assemble
 from hilctl.run.unpaced import run_in_memory
-from hilctl.signals import cycle_metrics
+from hilctl.signals.segment_metrics import SegmentMetrics
 from hilctl.waveforms.build import Reference, build
 from hilctl.waveforms.spec import AnyWaveform, Sine, Triangle
 
@@ -32,6 +32,7 @@ STROKE = 0.98
 TIMED_SAMPLES = 20_000
 _ROUNDS = 5
 _SOFT_S = 0.2
+_METRICS = ("peak_hysteresis_percent", "peak_error_percent", "rms_error_percent")
 _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID)
 
 
@@ -135,19 +136,15 @@ def _judged(reference: Reference, displacement_um: F64, flags: U32) -> list[Inve
         start, stop, cycles = segment.steady_cycles()
         if cycles == 0:
             raise InputError(f"{segment.label}: no steady cycle: use a longer waveform")
-        signals = (reference.values[start:stop], displacement_um[start:stop])
-        cycle = cycle_metrics.fold(np.arange(start, stop) - segment.start, segment.period, signals)
-        wanted, moved = cycle.signals
-        peak, rms = cycle_metrics.peak_and_rms_percent(
-            moved - wanted, cycle_metrics.peak_to_peak(wanted)
-        )
+        metrics = SegmentMetrics(segment, averaged=True, compensated=True)
+        signals = np.array((reference.values[start:stop], displacement_um[start:stop]))
+        metrics.add(np.arange(start, stop), signals)
+        found = metrics.metrics()
         trials.append(
             InverseTrial(
                 label=segment.label,
                 frequency_hz=reference.sample_rate_hz / segment.period,
-                peak_hysteresis_percent=cycle_metrics.peak_hysteresis_percent(wanted, moved),
-                peak_error_percent=peak,
-                rms_error_percent=rms,
+                **{name: found.get(name) for name in _METRICS},
                 limited_samples=int(np.count_nonzero(flags[start:stop] & _LIMITED)),
             )
         )

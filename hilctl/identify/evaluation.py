@@ -254,14 +254,12 @@ def _loop_error(record: Record, response_um: F64, target_um: F64) -> LoopScore:
     )
 
 
-def weight_roots(data: Records, weight_by: Literal["equal", "hysteresis"]) -> F64:
+def weight_roots(data: FitData, weight_by: Literal["equal", "hysteresis"]) -> F64:
     """Return the square root of the weight of each evaluated sample: float64[N]."""
-    sizes = [
-        record.command.size - (0 if isinstance(record, SteadyLoop) else record.ignore)
-        for record in data
-    ]
-    weights = np.ones(len(sizes)) if weight_by == "equal" else hysteresis_weights(data)
-    return np.repeat(np.sqrt(weights), sizes)
+    if weight_by == "equal":
+        return np.ones(data.target_um.size)
+    sizes = [place.stop - place.start for place in data.places]
+    return np.repeat(np.sqrt(hysteresis_weights(data.records)), sizes)
 
 
 def hysteresis_weights(data: Records) -> F64:

@@ -84,7 +84,7 @@ def verdict_of(
     suggestions = _suggestions(fit, records, settings)
     if reasons:
         return verdict("not a model", reasons=reasons, notes=tuple(suggestions))
-    notes = [*_one_frequency(records), *_one_amplitude(records)]
+    notes = list(_alike_loops(records))
     # Held-out loops of one amplitude or frequency say nothing about others. A PPI has no rate, and
     # its plays follow a whole history up to the largest swing, which determines smaller ones.
     histories = not any(isinstance(record, SteadyLoop) for record in records)
@@ -171,28 +171,20 @@ def _unfollowed(records: Sequence[Record]) -> str:
     return "check coil, amplifier, sensor and columns"
 
 
-def _one_amplitude(records: Sequence[Record]) -> list[str]:
-    if not _alike(np.concatenate([_swings(record)[1] for record in records])):
-        return []
-    return [
-        "all loops have one amplitude, so smaller loops are unknown: add loops at other amplitudes"
-    ]
-
-
-def _one_frequency(records: Sequence[Record]) -> list[str]:
-    frequencies_hz = np.concatenate([_swings(record)[0] for record in records])
-    if not _alike(frequencies_hz):
-        return []
-    return [
-        f"all loops are at {np.median(frequencies_hz):.3g} Hz, so the influence of the rate is "
-        "unknown: add loops at other frequencies"
-    ]
-
-
-def _alike(values: F64) -> bool:
-    """Return whether values are one value, apart from a tenth of them at each end."""
-    low, high = np.percentile(values, (10.0, 90.0), method="nearest")
-    return bool(high < ALIKE * low)
+def _alike_loops(records: Sequence[Record]) -> Iterator[str]:
+    """Yield that loops have one frequency or amplitude, except for a tenth of them at each end."""
+    frequencies_hz, sizes = map(np.concatenate, zip(*map(_swings, records), strict=True))
+    low, high = np.percentile((frequencies_hz, sizes), (10.0, 90.0), axis=1, method="nearest")
+    if high[0] < ALIKE * low[0]:
+        yield (
+            f"all loops are at {np.median(frequencies_hz):.3g} Hz, so the influence of the rate is "
+            "unknown: add loops at other frequencies"
+        )
+    if high[1] < ALIKE * low[1]:
+        yield (
+            "all loops have one amplitude, so smaller loops are unknown: add loops at other "
+            "amplitudes"
+        )
 
 
 def _swings(record: Record) -> tuple[F64, F64]:

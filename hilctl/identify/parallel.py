@@ -3,7 +3,7 @@
 import os
 import threading
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from concurrent.futures import Executor, ProcessPoolExecutor, ThreadPoolExecutor
+from concurrent.futures import ProcessPoolExecutor, ThreadPoolExecutor
 from contextlib import contextmanager
 from functools import cache
 from multiprocessing import get_context
@@ -61,34 +61,24 @@ def workers(scheduler: str = "none") -> Iterator[MapFunction]:
     """
     if scheduler == "none":
         yield map  # serial
-    elif scheduler in SCHEDULERS:
-        with _local(scheduler) as executor:
-            yield executor.map
+    elif scheduler == "processes":  # spawned: a fork would copy BLAS's threads
+        with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
+            yield processes.map
+    elif scheduler == "threads":
+        unwanted = threading.Event()
+        initial = _worker, "unwanted", unwanted
+        with ThreadPoolExecutor(initializer=setattr, initargs=initial) as threads:
+            try:
+                yield threads.map
+            except BaseException:
+                unwanted.set()  # Ctrl-C does not wait for fits to end
+                raise
     elif "://" in scheduler:
         with _dask(scheduler) as distributed:
             yield distributed
     else:
         known = f"{', '.join(SCHEDULERS)} or an address such as tcp://host:8786"
         raise InputError(f"scheduler must be {known}: {scheduler!r}")
-
-
-@contextmanager
-def _local(scheduler: str) -> Iterator[Executor]:
-    if scheduler == "processes":  # spawned: a fork would copy BLAS's threads
-        with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
-            yield processes
-        return
-    unwanted = threading.Event()
-
-    def begin() -> None:
-        _worker.unwanted = unwanted
-
-    with ThreadPoolExecutor(initializer=begin) as threads:
-        try:
-            yield threads
-        except BaseException:
-            unwanted.set()  # Ctrl-C does not wait for fits to end
-            raise
 
 
 @contextmanager

@@ -7,6 +7,7 @@ from hilctl.identify.evaluation import Evaluation, LoopScore
 from hilctl.identify.fit_model import FittedModel
 from hilctl.identify.model_quality import Verdict
 from hilctl.identify.pipeline import Identification
+from hilctl.identify.refine.acceptance import ErrorChange
 from hilctl.identify.refine.refinement import Refinement
 
 Table: TypeAlias = tuple[tuple[str, ...], list[tuple[str, ...]]]
@@ -15,12 +16,17 @@ Table: TypeAlias = tuple[tuple[str, ...], list[tuple[str, ...]]]
 
 def loop_table(errors: Sequence[LoopScore]) -> Table:
     """Return the errors of each loop."""
-    rows = []
-    for error in errors:
-        area = "-" if error.area_error_percent is None else f"{error.area_error_percent:+.2f}"
-        figures = (error.peak_to_peak_um, error.peak_percent, error.rms_percent)
-        rows.append((error.label, *(f"{figure:.3g}" for figure in figures), area))
-    return ("loop", "p-p µm", "peak %", "rms %", "area %"), rows
+    return ("loop", "p-p µm", "peak %", "rms %", "area %"), [
+        (
+            *_row(error.label, error.peak_to_peak_um, error.peak_percent, error.rms_percent),
+            "-" if error.area_error_percent is None else f"{error.area_error_percent:+.2f}",
+        )
+        for error in errors
+    ]
+
+
+def _row(label: str, *figures: float) -> tuple[str, ...]:
+    return (label, *(f"{figure:.3g}" for figure in figures))
 
 
 def parameter_texts(fit: FittedModel) -> list[tuple[str, str]]:
@@ -75,28 +81,25 @@ def _span(limits: tuple[float, float]) -> str:
 
 def refinement_table(found: Refinement) -> Table:
     """Return the errors of each held-out run before and after."""
-    before, after = (held.judgement.errors for held in (found.choice.before, found.choice.after))
-    rows = []
-    for was, now in zip(before, after, strict=True):
-        figures = [was.peak_to_peak_um, was.peak_percent, now.peak_percent]
-        figures += [was.rms_percent, now.rms_percent]
-        rows.append((was.label, *(f"{figure:.3g}" for figure in figures)))
-    return ("run", "p-p µm", "peak % before", "after", "rms % before", "after"), rows
+    return _change_table(("run", "p-p µm"), found.choice.runs)
 
 
 def class_table(found: Refinement) -> Table:
     """Return the errors of each class of held-out runs before and after."""
-    rows = []
-    for each in found.choice.classes:
-        figures = [each.peak_to_peak_um, each.peak_before, each.peak_after]
-        rows.append((each.label, *(f"{n:.3g}" for n in (*figures, each.before, each.after))))
-    return ("class", "largest p-p µm", "peak % before", "after", "rms % before", "after"), rows
+    return _change_table(("class", "largest p-p µm"), found.choice.classes)
+
+
+def _change_table(first: tuple[str, str], changes: Sequence[ErrorChange]) -> Table:
+    return (*first, "peak % before", "after", "rms % before", "after"), [
+        _row(e.label, e.peak_to_peak_um, e.peak_before, e.peak_after, e.before, e.after)
+        for e in changes
+    ]
 
 
 def stroke_table(verdict: Verdict) -> Table:
     """Return the errors of each class of motions."""
     return ("stroke", "peak %", "rms %", "motions"), [
-        (each.label, f"{each.peak_percent:.3g}", f"{each.rms_percent:.3g}", f"{each.motions}")
+        (*_row(each.label, each.peak_percent, each.rms_percent), f"{each.motions}")
         for each in verdict.classes
     ]
 

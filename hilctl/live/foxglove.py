@@ -14,7 +14,6 @@ import logging
 import threading
 import time
 from collections.abc import Callable, Collection, Iterator
-from contextlib import contextmanager
 from itertools import repeat
 from typing import TYPE_CHECKING, Any, Literal
 
@@ -222,16 +221,6 @@ class FoxgloveServer:
             self._channels[message.topic].log(message.data, log_time=message.time_ns)
 
 
-@contextmanager
-def _logging_as_before() -> Iterator[None]:
-    """Restore the level and handlers of all logs, which the library changes globally."""
-    root = logging.getLogger()
-    level, handlers = root.level, root.handlers[:]
-    yield
-    root.setLevel(level)
-    root.handlers[:] = handlers
-
-
 def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServer"]:
     """Return the context, without which the server loses its channels, the channels, the server."""
     try:
@@ -240,8 +229,11 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
         raise InputError(
             "--foxglove: its library is not installed: pip install 'hilctl[foxglove]'"
         ) from None
-    with _logging_as_before():
-        foxglove.set_log_level("ERROR")  # discards messages on invalid requests
+    root = logging.getLogger()
+    level, handlers = root.level, root.handlers[:]
+    foxglove.set_log_level("ERROR")  # discards messages on invalid requests; changes all logs
+    root.setLevel(level)
+    root.handlers[:] = handlers
     context = foxglove.Context()
     descriptors = schema.descriptor_set()
     channels = {

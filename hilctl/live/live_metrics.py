@@ -17,6 +17,7 @@ from hilctl.live.scope import ROW, SIGNALS, Traces
 from hilctl.run.metadata import LimitBounds, RunDescription
 from hilctl.signals.cycle_metrics import sensor_noise_um
 from hilctl.signals.segment_metrics import SegmentMetrics
+from hilctl.signals.spectrum import amplitude_spectrum, in_bands
 
 WARNING_USED, ERROR_USED = 0.8, 0.95
 """Used fractions of a limit above which a gauge is a warning or an error."""
@@ -233,14 +234,9 @@ class LiveErrorSpectrum:
         size = 1 << (self._newest.size.bit_length() - 1) if self._newest.size else 0
         if size < 256:
             return np.empty(0), np.empty(0)
-        window = np.hanning(size)
-        error_um = self._newest[-size:]
-        lines_um = np.abs(np.fft.rfft((error_um - error_um.mean()) * window))
-        lines_um *= 2.0 / window.sum()
-        # Maximum, so that a single line remains visible.
-        edges = np.unique(np.geomspace(1, lines_um.size, _SPECTRUM_POINTS).astype(np.int64))[:-1]
-        largest_um: F64 = np.maximum.reduceat(lines_um, edges)
-        return edges.astype(np.float64) * np.float64(self._rate_hz / size), largest_um
+        lines = amplitude_spectrum(self._newest[-size:], self._rate_hz)
+        hz, _, largest_um = in_bands(*lines, _SPECTRUM_POINTS)
+        return hz, largest_um
 
 
 class LatenessCounts:

@@ -82,17 +82,11 @@ _LOOP_S = 2.0
 
 @dataclass(frozen=True, slots=True)
 class Buckets:
-    """Consecutive buckets of samples.
+    """Consecutive buckets of samples: float64[signals, n] each."""
 
-    Attributes:
-        low: Minimum of each signal, float64[signals, n]; NaN if a bucket has no sample.
-        high: Maximum of each signal, same shape.
-        first: Values of the first sample of each bucket, same shape.
-    """
-
-    low: F64
-    high: F64
-    first: F64
+    low: F64  # minimum of each signal; NaN if a bucket has no sample
+    high: F64  # maximum
+    first: F64  # value of the first sample
 
 
 class MinMaxTrace:
@@ -141,14 +135,9 @@ class MinMaxTrace:
 
 @dataclass(frozen=True, slots=True)
 class ScopeWindow:
-    """Content of a scope.
+    """Content of a scope."""
 
-    Attributes:
-        t_s: float64[n], start of each bucket: relative to now if rolling, to the start of the cycle
-            if triggered.
-    """
-
-    t_s: F64
+    t_s: F64  # float64[n], start of each bucket: relative to now, or to the start of the cycle
     buckets: Buckets
 
 

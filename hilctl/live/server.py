@@ -19,7 +19,7 @@ import sys
 import tempfile
 import time
 from asyncio.subprocess import DEVNULL, PIPE
-from collections.abc import Awaitable, Callable, Sequence
+from collections.abc import Awaitable, Callable
 from contextlib import AsyncExitStack, ExitStack, suppress
 from functools import cache
 from http import HTTPStatus
@@ -280,7 +280,7 @@ class LiveServer:
         """Serve until ``over`` returns true."""
         settings: dict[str, Any] = {
             "process_request": self._admit,
-            "select_subprotocol": _our_protocol,
+            "subprotocols": [PROTOCOL],  # never the token, which is offered too
             "compression": None,  # slower than loopback
             "server_header": None,
             "open_timeout": 3.0,
@@ -399,14 +399,6 @@ class LiveServer:
                 "signals": [[each.name, each.label, each.unit] for each in feed.signals],
             }
         return finite_json(state)
-
-
-def _our_protocol(
-    connection: ServerConnection, offered: Sequence[Subprotocol]
-) -> Subprotocol | None:
-    """Select the protocol of the page, never the token, which is offered too."""
-    del connection
-    return PROTOCOL if PROTOCOL in offered else None
 
 
 def _quiet() -> logging.Logger:

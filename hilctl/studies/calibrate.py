@@ -23,6 +23,7 @@ from hilctl.base.types import F64
 from hilctl.base.yaml import dump, load_document
 from hilctl.experiment.load import load_experiment
 from hilctl.recording.reader import read
+from hilctl.signals.cycle_metrics import rms
 from hilctl.studies.characterise.characterisation_runner import without_reference
 from hilctl.studies.step_runner import StudyHost, raise_if_stopped, setting
 
@@ -102,7 +103,7 @@ def fit_sensor(name: str, reading: F64, true: F64, origin: Origin) -> Calibratio
         _polynomial(reading, true, order)
         for order in range(1, min(_HIGHEST_ORDER, np.unique(reading).size - 2) + 1)
     ]
-    errors = [_rms(left_out) for _, left_out in fits]
+    errors = [rms(left_out) for _, left_out in fits]
     # Rounding errors of exact points must not count as noise.
     enough = _BETTER * min(errors) + 1e-9 * float(np.ptp(true))
     curve, _ = fits[next(order for order, error in enumerate(errors) if error <= enough)]
@@ -111,7 +112,7 @@ def fit_sensor(name: str, reading: F64, true: F64, origin: Origin) -> Calibratio
     knots, mean = _averaged(reading, true)
     share = (knots[1:-1] - knots[:-2]) / (knots[2:] - knots[:-2])  # between the neighbours
     left_out = mean[1:-1] - (mean[:-2] + share * (mean[2:] - mean[:-2]))
-    if _MUCH_BETTER * _rms(left_out) + 1e-9 * float(np.ptp(true)) < min(errors):
+    if _MUCH_BETTER * rms(left_out) + 1e-9 * float(np.ptp(true)) < min(errors):
         shape = {"table": tuple(zip(knots.tolist(), mean.tolist(), strict=True))}
         reading, true, residuals, freedom = knots[1:-1], mean[1:-1], left_out, left_out.size
     try:
@@ -142,10 +143,6 @@ def _averaged(x: F64, y: F64) -> tuple[F64, F64]:
     """Return the distinct values of ``x``, and the mean of ``y`` at each."""
     knots, at = np.unique(x, return_inverse=True)
     return knots, np.bincount(at, y) / np.bincount(at)
-
-
-def _rms(values: F64) -> float:
-    return float(np.sqrt(np.mean(values**2)))
 
 
 def measure_amplifier(

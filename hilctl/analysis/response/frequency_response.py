@@ -10,7 +10,7 @@ of averaged spectra.
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
 from typing import Any, Literal, NamedTuple, TypeAlias, get_args
@@ -192,13 +192,6 @@ class Lines(NamedTuple):
     free: FreeLines | None = None
 
 
-class _Columns(NamedTuple):
-    """Columns of input and output."""
-
-    sent: str
-    answered: str
-
-
 def frequency_response(recording: Recording, signals: Signals | None = None) -> FrequencyResponse:
     """Return the response of a run's last multisine, random or chirp segment, or of all its sines.
 
@@ -268,9 +261,10 @@ def measured_lines(recording: Recording, signals: Signals) -> MeasuredLines:
     return MeasuredLines(lines, method, excitation, excited)
 
 
-def _columns(recording: Recording, signals: Signals) -> _Columns:
+def _columns(recording: Recording, signals: Signals) -> list[str]:
+    """Return the columns of input and output."""
     units = {"displacement": "_um", "reference": "_um", "input": "_um"}
-    columns = _Columns(*(f"{each}{units.get(each, '')}" for each in signals.split("-")))
+    columns = [f"{each}{units.get(each, '')}" for each in signals.split("-")]
     for name in columns:
         if not np.isfinite(recording.samples.column(name)).any():
             raise InputError(f"{recording.path}: {name} is not recorded: use other --signals")
@@ -298,7 +292,7 @@ def _excitation(recording: Recording) -> tuple[list[Segment], Method]:
 
 
 def _broad(
-    recording: Recording, segment: Segment, columns: _Columns, method: Method
+    recording: Recording, segment: Segment, columns: Sequence[str], method: Method
 ) -> tuple[Lines, Method]:
     """Return the lines of one segment, from whole periods if it has them."""
     samples = steady_part(recording, segment).samples
@@ -391,7 +385,7 @@ def _averaged(sent: F64, answered: F64, size: int, rate_hz: float) -> Lines:
     return Lines(hz, response, noise, coherence, 0.5 * float(np.ptp(sent)), averages)
 
 
-def _sines(recording: Recording, segments: list[Segment], columns: _Columns) -> Lines:
+def _sines(recording: Recording, segments: list[Segment], columns: Sequence[str]) -> Lines:
     """Return one line per sine, from its steady cycles."""
     found = []
     for segment in segments:

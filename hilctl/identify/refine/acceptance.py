@@ -8,9 +8,12 @@ import math
 from collections.abc import Sequence
 from dataclasses import dataclass, replace
 
+import numpy as np
+
 from hilctl.base.errors import InputError
 from hilctl.identify.evaluation import LoopScore
 from hilctl.models.base import STROKES, stroke_class
+from hilctl.signals import cycle_metrics
 
 WORTH = 0.9  # error of one class, of the old one: a smaller gain is not worth the risk
 LOSS = 0.1  # of its old error, by which each run may get worse
@@ -101,8 +104,8 @@ class AcceptanceRule:
             ErrorChange(
                 name,
                 max(run.peak_to_peak_um for run in found),
-                _rms([run.before for run in found]),
-                _rms([run.after for run in found]),
+                cycle_metrics.rms(np.array([run.before for run in found])),
+                cycle_metrics.rms(np.array([run.after for run in found])),
                 max(run.peak_before for run in found),
                 max(run.peak_after for run in found),
             )
@@ -142,7 +145,3 @@ class AcceptanceRule:
         most = max(LOSS * run.before, self.tolerance_percent)
         most_peak = max(LOSS * run.peak_before, PEAK * self.tolerance_percent)
         return max(run.increase - most, run.peak_increase - most_peak)
-
-
-def _rms(errors: Sequence[float]) -> float:
-    return math.sqrt(math.fsum(error**2 for error in errors) / len(errors))

@@ -101,7 +101,7 @@ def searched_fit(problem: "SearchProblem", job: FitJob) -> FoundModel:
     """Return the model that solves a problem."""
     data, settings = job.data, job.settings
     rng = np.random.default_rng(SEED)
-    roots = weight_roots(data.records, settings.weight_by)
+    roots = weight_roots(data, settings.weight_by)
     scale = np.append(roots, np.ones(problem.held))
     x, starts = search(problem, scale, data.stroke_um, settings.starts, rng, job.progress)
     known = problem.parameters(x, scale)

@@ -2,18 +2,28 @@
 
 import math
 from dataclasses import dataclass, replace
+from typing import TypeAlias
 
 import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.identify.fit_api import LEAST_SLOPE
-from hilctl.identify.fit_data import LAG_S, PARAMETERS, FitData, Linear
+from hilctl.identify.fit_data import (
+    GAMMA_S,
+    GROWTH,
+    LAG_S,
+    PARAMETERS,
+    SPACING,
+    FitData,
+    Linear,
+)
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.staged import FieldLag, StagedModel
 
 STEEPEST = 5.0  # largest slope of the deadband function, relative to that around 0
 DYNAMIC = PARAMETERS + 3
+DELAY, C_S, Q_S2 = range(PARAMETERS, DYNAMIC)
 FORGOTTEN = 300.0  # half periods per time constant, beyond which a lag has no effect
 RADIAN = 0.16  # 1 / (2 pi)
 
@@ -244,22 +254,38 @@ def structure_of(linear: Linear) -> tuple[float, float]:
     return 1.0 / (2.0 * math.pi * radian_s), linear.c_s / (2.0 * radian_s)
 
 
-def parameters(layers: Layers, point: Point) -> dict[str, float]:
+Parameter: TypeAlias = tuple[float, dict[int, float]]
+"""Value of a reported parameter, and its derivatives by those of ``Point.pack`` by number."""
+
+
+def parameters(layers: Layers, point: Point) -> dict[str, Parameter]:
     """Return the parameters by name; weights are numbered as in (5.5) and (6.6)."""
-    out: dict[str, float] = {}
+    x = point.pack()
+
+    def own(number: int) -> Parameter:
+        return float(x[number]), {number: 1.0}
+
+    out: dict[str, Parameter] = {}
     if layers.lag:
-        out |= {"tau_s": float(point.before[0]), "growth_per_unit": float(point.before[1])}
+        out |= {"tau_s": own(LAG_S), "growth_per_unit": own(GROWTH)}
     if layers.structure:
-        out["natural_hz"], out["damping_ratio"] = structure_of(point.linear)
+        natural_hz, damping = structure_of(point.linear)
+        radian_s, c_s = math.sqrt(point.linear.q_s2), point.linear.c_s
+        out["natural_hz"] = natural_hz, {Q_S2: -0.25 / (math.pi * radian_s**3)}
+        by_q = -0.25 * c_s / radian_s**3
+        out["damping_ratio"] = damping, {C_S: 0.5 / radian_s, Q_S2: by_q}
     if layers.staged:
-        out["delay_s"] = point.linear.delay_s
-    out["alpha"] = float(point.before[2])
+        out["delay_s"] = own(DELAY)
+    out["alpha"] = own(SPACING)
     if layers.gamma:
-        out["gamma"] = float(point.before[3])
-    out |= {"a_0": point.direct, "g_0": 1.0}
-    out |= dict(zip(("d_p", "d_n"), point.spacings_um, strict=True))
-    out |= {f"a_{i}": float(a) for i, a in enumerate(point.weights, start=1)}
-    up, down = np.diff(point.up, prepend=1.0), np.diff(point.down, prepend=1.0)
-    out |= {f"g_{j}": float(g) for j, g in enumerate(up, start=1)}
-    out |= {f"g_-{j}": float(g) for j, g in enumerate(down, start=1)}
-    return out | ({"output_offset_um": point.offset_um} if layers.offset else {})
+        out["gamma"] = own(GAMMA_S)
+    out |= {"a_0": own(DYNAMIC), "g_0": (1.0, {}), "d_p": own(x.size - 3), "d_n": own(x.size - 2)}
+    out |= {f"a_{i}": own(DYNAMIC + i) for i in range(1, layers.plays + 1)}
+    slopes = DYNAMIC + layers.plays + 1
+    for side, first in (("", slopes), ("-", slopes + layers.deadbands)):
+        for j in range(layers.deadbands):
+            # A weight is the change of slope from the deadband before; the first has slope 1.
+            value, by = own(first + j)
+            before = {first + j - 1: -1.0} if j else {}
+            out[f"g_{side}{j + 1}"] = value - float(x[first + j - 1] if j else 1.0), by | before
+    return out | ({"output_offset_um": own(x.size - 1)} if layers.offset else {})

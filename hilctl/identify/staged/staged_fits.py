@@ -7,6 +7,7 @@ sides have a common factor.
 """
 
 import math
+from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
 from typing import Any
@@ -17,14 +18,7 @@ from hilctl.base.errors import DataError
 from hilctl.base.types import F64, I64
 from hilctl.identify.evaluation import weight_roots
 from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel, StartOutcome
-from hilctl.identify.fit_data import (
-    GAMMA_S,
-    GROWTH,
-    LAG_S,
-    SPACING,
-    FitData,
-    Linear,
-)
+from hilctl.identify.fit_data import GROWTH, LAG_S, FitData, Linear
 from hilctl.identify.least_squares import (
     bounded_weights,
     descend,
@@ -34,11 +28,11 @@ from hilctl.identify.least_squares import (
 from hilctl.identify.literature import fit_triangle, triangle_thresholds
 from hilctl.identify.settings import FitSettings
 from hilctl.identify.staged.objective import (
-    DYNAMIC,
     RADIAN,
     STAGE_PARAMETERS,
     STEEPEST,
     Layers,
+    Parameter,
     Point,
     bounds,
     error_and_slopes,
@@ -176,7 +170,7 @@ def find_staged(job: FitJob, data: FitData, layers: Layers) -> StagedEnd:
     stage has dynamics, and a record is not steady or sample rates differ.
     """
     settings, progress = job.settings, job.progress
-    scale = weight_roots(job.data.records, settings.weight_by)
+    scale = weight_roots(job.data, settings.weight_by)
     _check(data, layers)
     progress(0.0, "weights for a few lags")
     few, few_scale = data.thinned(scale, FEW_POINTS)
@@ -235,12 +229,11 @@ def _grid(data: FitData, layers: Layers, scale: F64) -> list[tuple[float, Point]
     return found
 
 
-DELAY, C_S, Q_S2 = range(SPACING + 2, DYNAMIC)
 RIDGE = 1e-9
 
 
 def standard_errors(
-    found: StagedEnd, layers: Layers, places: tuple[slice, ...]
+    found: StagedEnd, by: Mapping[str, Parameter], places: tuple[slice, ...]
 ) -> dict[str, float]:
     """Return standard errors of free parameters; none for fewer than two records.
 
@@ -252,8 +245,7 @@ def standard_errors(
         return {}
     covariance = _covariance(found, places)
     out: dict[str, float] = {}
-    by = _stages(found, layers) | _operators(layers, covariance.shape[0])
-    for name, slopes in by.items():
+    for name, (_, slopes) in by.items():
         if not found.free[list(slopes)].any():
             continue
         row = np.zeros(covariance.shape[0])
@@ -262,38 +254,9 @@ def standard_errors(
     return out
 
 
-def at_bound(found: StagedEnd, layers: Layers) -> tuple[str, ...]:
+def at_bound(found: StagedEnd, by: Mapping[str, Parameter]) -> tuple[str, ...]:
     """Return the names of parameters at a bound; see :func:`standard_errors`."""
-    by = _stages(found, layers) | _operators(layers, found.held.size)
-    return tuple(name for name, slopes in by.items() if found.held[next(iter(slopes))])
-
-
-def _stages(found: StagedEnd, layers: Layers) -> dict[str, dict[int, float]]:
-    """Return the derivatives of each reported parameter of the stages by fitted ones."""
-    by: dict[str, dict[int, float]] = {}
-    if layers.lag:
-        by |= {"tau_s": {LAG_S: 1.0}, "growth_per_unit": {GROWTH: 1.0}}
-    if layers.gamma:
-        by["gamma"] = {GAMMA_S: 1.0}
-    if layers.delay:
-        by["delay_s"] = {DELAY: 1.0}
-    if layers.structure:
-        radian_s, c_s = math.sqrt(found.point.linear.q_s2), found.point.linear.c_s
-        by["natural_hz"] = {Q_S2: -0.25 / (math.pi * radian_s**3)}
-        by["damping_ratio"] = {C_S: 0.5 / radian_s, Q_S2: -0.25 * c_s / radian_s**3}
-    return by
-
-
-def _operators(layers: Layers, size: int) -> dict[str, dict[int, float]]:
-    by: dict[str, dict[int, float]] = {"alpha": {SPACING: 1.0}}
-    by |= {f"a_{i}": {DYNAMIC + i: 1.0} for i in range(layers.plays + 1)}
-    for side, first in enumerate((DYNAMIC + layers.plays + 1, size - 3 - layers.deadbands)):
-        for j in range(layers.deadbands):
-            # A weight is the change of slope from the deadband before; the first has slope 1.
-            before = {first + j - 1: -1.0} if j else {}
-            by[f"g_{'-' if side else ''}{j + 1}"] = {first + j: 1.0} | before
-    by |= {"d_p": {size - 3: 1.0}, "d_n": {size - 2: 1.0}}
-    return by | ({"output_offset_um": {size - 1: 1.0}} if layers.offset else {})
+    return tuple(name for name, (_, slopes) in by.items() if found.held[list(slopes)[:1]].any())
 
 
 def _covariance(found: StagedEnd, places: tuple[slice, ...]) -> F64:
@@ -383,12 +346,7 @@ def _layers(settings: FitSettings, **stages: Any) -> Layers:
 def _found(
     data: FitData, layers: Layers, end: StagedEnd, model: IntegratedModel | StagedModel
 ) -> FoundModel:
-    known = parameters(layers, end.point)
-    return FoundModel(
-        model,
-        len(known) - 1,
-        known,
-        end.starts,
-        standard_errors(end, layers, data.places),
-        at_bound(end, layers),
-    )
+    by = parameters(layers, end.point)
+    known = {name: value for name, (value, _) in by.items()}
+    errors = standard_errors(end, by, data.places)
+    return FoundModel(model, len(known) - 1, known, end.starts, errors, at_bound(end, by))

@@ -53,11 +53,6 @@ class CharacterisationLimits:
         return round_hz(math.sqrt(self.lowest_hz * self.highest_hz))
 
     @property
-    def stroke_span_um(self) -> float:
-        """Width of the allowed stroke."""
-        return self.stroke_um[1] - self.stroke_um[0]
-
-    @property
     def slew_per_s(self) -> float:
         """Largest rate of change of a command, with a margin to the limit."""
         return _OF_SLEW * self.loaded.config.limits.slew_per_s

@@ -157,11 +157,6 @@ def _measured_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
         yield "change at the end", f"{repeated.shape_percent:.2g} % in shape, {shift}"
 
 
-def write_characterisation(found: Characterisation, path: Path) -> None:
-    """Write the page, replacing an existing file."""
-    html.write_page(characterisation_page(found), path)
-
-
 def characterisation_page(found: Characterisation) -> str:
     """Return the page as HTML."""
     rows = [

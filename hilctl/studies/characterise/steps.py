@@ -3,6 +3,7 @@
 import math
 from collections.abc import Callable
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import NoReturn, TypeAlias
 
 import numpy as np
@@ -34,7 +35,7 @@ GROWING_PARTS = (0.1, 0.25, 0.5, 0.75, 1.0)
 
 _RANDOM_PART = 0.95
 _CYCLES = 12.0
-_LOUD = 0.05  # rms noise, of the whole stroke, that hides any motion
+_LOUD_PERCENT = 5.0  # rms noise, of the whole stroke, that hides any motion
 _LEAST_MOTION = 6.0  # peak-to-peak displacement of the largest loop, over the rms noise
 _CLEAR_OF_BAND = 1.5
 _SAFE_OF_RESONANCE = 3.0
@@ -82,15 +83,12 @@ def _take_rest(recording: Recording, limits: Limits, measured: Measured) -> Eval
     return replace(measured, rest=found), text
 
 
-def _polarity(part: float) -> Waveform:
-    def make(limits: Limits, measured: Measured) -> Keys | None:
-        if measured.reaction is not None and measured.reaction.clear:
-            return None
-        amplitude = part * limits.reach
-        offset = limits.beside_rest(amplitude)
-        return waveforms.sine(limits, amplitude, limits.middle_hz, _CYCLES, offset=offset)
-
-    return make
+def _polarity(part: float, limits: Limits, measured: Measured) -> Keys | None:
+    if measured.reaction is not None and measured.reaction.clear:
+        return None
+    amplitude = part * limits.reach
+    offset = limits.beside_rest(amplitude)
+    return waveforms.sine(limits, amplitude, limits.middle_hz, _CYCLES, offset=offset)
 
 
 def _take_polarity(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
@@ -126,8 +124,8 @@ def _refuse_silent(
 ) -> NoReturn:
     noise_um = measured.rest.noise_um if measured.rest else 0.0
     sine = f"a sine of {amplitude:.3g} {limits.unit}, {percent:.2g} % of the range"
-    if noise_um > _LOUD * limits.stroke_span_um:
-        share = 100.0 * noise_um / limits.stroke_span_um
+    share = 100.0 * noise_um / (limits.stroke_um[1] - limits.stroke_um[0])
+    if share > _LOUD_PERCENT:
         raise RigProblemError(
             "noise",
             f"noise is larger than the motion: {noise_um:.3g} µm rms at rest, {share:.0f} % of the "
@@ -141,13 +139,10 @@ def _refuse_silent(
     )
 
 
-def _response(part: float) -> Waveform:
-    def make(limits: Limits, measured: Measured) -> Keys | None:
-        if measured.small is not None:
-            return None
-        return waveforms.small_multisine(limits, part * limits.reach)
-
-    return make
+def _response(part: float, limits: Limits, measured: Measured) -> Keys | None:
+    if measured.small is not None:
+        return None
+    return waveforms.small_multisine(limits, part * limits.reach)
 
 
 def _take_response(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
@@ -175,12 +170,9 @@ def _take_response(recording: Recording, limits: Limits, measured: Measured) -> 
     return replace(measured, small=found), text
 
 
-def _growing(part: float) -> Waveform:
-    def make(limits: Limits, measured: Measured) -> Keys | None:
-        amplitude = next_amplitude(measured.growing, part * limits.reach, limits.stroke_um)
-        return None if amplitude is None else _middle_loop(limits, amplitude)
-
-    return make
+def _growing(part: float, limits: Limits, measured: Measured) -> Keys | None:
+    amplitude = next_amplitude(measured.growing, part * limits.reach, limits.stroke_um)
+    return None if amplitude is None else _middle_loop(limits, amplitude)
 
 
 def _middle_loop(limits: Limits, amplitude: float) -> Keys:
@@ -282,11 +274,11 @@ def _numbered(
     name: str,
     purpose: str,
     parts: tuple[float, ...],
-    waveform: Callable[[float], Waveform],
+    waveform: Callable[[float, Limits, Measured], Keys | None],
     take: Evaluate,
 ) -> list[_Row]:
     return [
-        (f"{name}-{i}", f"{purpose}, {100.0 * part:g} %", waveform(part), take)
+        (f"{name}-{i}", f"{purpose}, {100.0 * part:g} %", partial(waveform, part), take)
         for i, part in enumerate(parts, 1)
     ]
 

@@ -45,10 +45,10 @@ def runs(tmp_path, monkeypatch):
 
     monkeypatch.setattr("hilctl.api.runs.start_run", start_run)
 
-    def write(contents, summary, page, before):
-        page.write_text(f"{summary.name}{' beside the one before' if before else ''}")
+    def page(contents, summary, before):
+        return f"{summary.name}{' beside the one before' if before else ''}"
 
-    monkeypatch.setattr("hilctl.api.reports.write_html", write)
+    monkeypatch.setattr("hilctl.api.reports.page", page)
     return seen, ends
 
 

@@ -128,8 +128,9 @@ def test_a_history_of_one_amplitude_or_frequency_tells_nothing_of_others(
     t = np.arange(4000) / 2000.0
     noise = 0.0005 * np.random.default_rng(3).standard_normal(t.size)
     history = History("h", command(t) + noise, command(t), 2000.0)
-    assert len(model_quality._one_amplitude([history])) == one_amplitude
-    assert len(model_quality._one_frequency([history])) == one_frequency
+    found = list(model_quality._alike_loops([history]))
+    assert len(found) == one_amplitude + one_frequency
+    assert any(" Hz" in text for text in found) == one_frequency
 
 
 def test_one_frequency_or_amplitude_is_good_for_a_ppi_at_most():

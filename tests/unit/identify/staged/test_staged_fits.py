@@ -10,7 +10,7 @@ from hilctl.base.errors import DataError
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import judge
 from hilctl.identify.fit_data import SPACING, Linear
-from hilctl.identify.staged.objective import DYNAMIC, Layers, Point, error_and_slopes
+from hilctl.identify.staged.objective import DYNAMIC, Layers, Point, error_and_slopes, parameters
 from hilctl.identify.staged.staged_fits import StagedEnd, at_bound, standard_errors
 from hilctl.models.implicit_models import PreisachModel
 from hilctl.models.linear_stages import FirstMode
@@ -123,6 +123,7 @@ def test_preisach_triangle_is_nearer_between_known_stages(loops_of):
 LAYERS = Layers(plays=1, deadbands=0, lag=False, structure=False, delay=False)
 SIZE, RECORDS, EACH = DYNAMIC + 2 + 3, 40, 30
 POINT = Point(np.zeros(4), Linear(), 1.0, np.ones(1), (1.0, 1.0), np.zeros(0), np.zeros(0), 0.0)
+BY = parameters(LAYERS, POINT)
 PLACES = tuple(slice(EACH * i, EACH * (i + 1)) for i in range(RECORDS))
 
 
@@ -143,22 +144,22 @@ def ended(noise_um, free, seed=1, bound=()):
 
 def test_records_that_differ_by_so_much_give_so_much_over_their_root():
     """Each record's own a_0 scatters by 0.5: the mean of 40 is known to 0.5 / sqrt(40)."""
-    found = standard_errors(ended(0.5, [DYNAMIC]), LAYERS, PLACES)
+    found = standard_errors(ended(0.5, [DYNAMIC]), BY, PLACES)
     assert found.keys() == {"a_0"}
     assert found["a_0"] == pytest.approx(0.5 / np.sqrt(RECORDS), rel=0.25)
 
 
 def test_a_parameter_that_was_not_free_has_none():
-    free = standard_errors(ended(0.5, [DYNAMIC, SPACING]), LAYERS, PLACES)
+    free = standard_errors(ended(0.5, [DYNAMIC, SPACING]), BY, PLACES)
     assert free.keys() == {"a_0", "alpha"}
 
 
 def test_one_record_disagrees_with_nobody():
-    assert standard_errors(ended(0.5, [DYNAMIC]), LAYERS, PLACES[:1]) == {}
+    assert standard_errors(ended(0.5, [DYNAMIC]), BY, PLACES[:1]) == {}
 
 
 def test_what_a_bound_holds_is_named():
-    held = at_bound(ended(0.5, [], bound=[0, SPACING, DYNAMIC + 1]), LAYERS)
+    held = at_bound(ended(0.5, [], bound=[0, SPACING, DYNAMIC + 1]), BY)
     assert held == ("alpha", "a_1")
 
 

@@ -74,15 +74,14 @@ def test_the_held_out_error_comes_first():
     assert page.count("<figcaption") == page.count("<svg") > 5
 
 
-def test_the_problem_is_at_the_top(tmp_path):
+def test_the_problem_is_at_the_top():
     stopped = replace(
         FOUND, held_out=(), problem="no <reaction>: look", measured=replace(FOUND.measured,
             small=None, growing=(), reversal=None
         ),
         steps=(StepRow("rest", "noise & drift", 2.0, 0.1, "0.03 um", "/x/01-rest.mcap"),),
     )  # fmt: skip
-    rig_page.write_characterisation(stopped, tmp_path / "model.html")
-    page = (tmp_path / "model.html").read_text(encoding="utf-8")
+    page = rig_page.characterisation_page(stopped)
     for said in ("no &lt;reaction&gt;", "30.0 nm rms", "noise &amp; drift", "01-rest.mcap"):
         assert said in page
     assert "<svg" not in page
