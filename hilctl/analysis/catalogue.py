@@ -92,10 +92,7 @@ def select(
 
     The condition is in the SQL of SQLite on the names of :func:`keys_of`; empty for all. A text may
     be in double quotes. A key with other characters is in square brackets, such as ``[label.batch
-    no]``.
-
-    Raises:
-        InputError: The condition is not valid, or a key is unknown.
+    no]``. Raise InputError if the condition is not valid, or a key is unknown.
     """
     names: set[str] = set()
     condition, key = (_TOKEN.sub(partial(_as_sql, names), text) for text in (where, sort))

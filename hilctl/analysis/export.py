@@ -49,11 +49,8 @@ def export(
     ``flags``. ``measured_a`` or ``measured_v`` exists if the device measures it. NPZ, Parquet and
     MATLAB files also have the facts of the run, and the experiment and model as YAML.
 
-    Args:
-        recording: The run, or its pieces in order for bounded memory
-            (:class:`hilctl.recording.reader.RecordingStream`).
-        path: File to write: ``.csv``, ``.npz``, ``.parquet`` or ``.mat``.
-        overwrite: Replace a file of that name.
+    For bounded memory, ``recording`` is the run's pieces in order
+    (:class:`hilctl.recording.reader.RecordingStream`).
 
     Raises:
         InputError: Unknown suffix, the file exists, cannot be written or cannot hold as many

@@ -3,7 +3,6 @@
 ``focus`` is the number of the segment shown in detail.
 """
 
-from collections.abc import Sequence
 from functools import partial
 from typing import NamedTuple
 
@@ -375,18 +374,30 @@ def hysteresis_loop(recording: Recording, focus: int = 0) -> FigureSpec | None:
     ideal = "the ideal line" if recording.compensated else "a linear fit"
     averaged = any(part.cycle is not None for part in parts)
     title = "average steady cycle" if averaged else "as measured, not averaged"
-    widest = parts[focus] if focus < len(parts) and loops[focus].size else None
-    draw = partial(_draw, recording=recording, loops=loops, focus=focus, widest=widest, line=line)
+    reached = [k for k, loop in enumerate(loops) if loop[0].size]
+    ends = np.array([everything[0].min(), everything[0].max()])
+    loop_input = "reference" if recording.compensated else "command"
+
+    def draw(axes: Axes, taken_off: F64) -> None:
+        for k, colour in zip(reached, _colours(len(reached)), strict=True):
+            named = len(reached) <= _MOST_LABELS or k in (reached[0], reached[-1], focus)
+            label = short_name(recording.segments[k].label) if named else "_unnamed"
+            off = loops[k][1] - np.polyval(taken_off, loops[k][0])
+            axes.plot(loops[k][0], off, color=colour, linewidth=0.9, label=label)
+        straight = np.polyval(line - taken_off, ends)
+        axes.plot(ends, straight, color=REFERENCE, linestyle=":", linewidth=0.8)
+        if focus in reached:
+            _mark_gap(axes, parts[focus], taken_off)
+        unit = "µm" if recording.compensated else recording.command_unit
+        name = "deviation" if taken_off.any() else "displacement"
+        axes.set(xlabel=f"{loop_input}, {unit}", ylabel=f"{name}, µm")
+
     panels = (
         Panel(partial(draw, taken_off=np.zeros(2)), title, 0.75),
         Panel(partial(draw, taken_off=line), f"deviation from {ideal}", 0.5),
     )
-    caption = f"Displacement against {_input_name(recording)}, and its deviation from {ideal}."
+    caption = f"Displacement against {loop_input}, and its deviation from {ideal}."
     return FigureSpec("hysteresis", caption, panels)
-
-
-def _input_name(recording: Recording) -> str:
-    return "reference" if recording.compensated else "command"
 
 
 def _loop(part: SteadyPart) -> F64:
@@ -402,32 +413,6 @@ def _closest_line(everything: F64) -> F64:
     if np.ptp(x) == 0.0:
         return np.array([0.0, float(y.mean())])
     return np.asarray(np.polyfit(x, y, 1), dtype=np.float64)
-
-
-def _draw(
-    axes: Axes,
-    recording: Recording,
-    loops: Sequence[F64],
-    focus: int,
-    widest: SteadyPart | None,
-    line: F64,
-    taken_off: F64,
-) -> None:
-    reached = [k for k, loop in enumerate(loops) if loop[0].size]
-    for k, colour in zip(reached, _colours(len(reached)), strict=True):
-        named = len(reached) <= _MOST_LABELS or k in (reached[0], reached[-1], focus)
-        label = short_name(recording.segments[k].label) if named else "_unnamed"
-        off = loops[k][1] - np.polyval(taken_off, loops[k][0])
-        axes.plot(loops[k][0], off, color=colour, linewidth=0.9, label=label)
-    everything = np.concatenate(loops, axis=1)
-    ends = np.array([everything[0].min(), everything[0].max()])
-    straight = np.polyval(line - taken_off, ends)
-    axes.plot(ends, straight, color=REFERENCE, linestyle=":", linewidth=0.8)
-    if widest is not None:
-        _mark_gap(axes, widest, taken_off)
-    unit = "µm" if recording.compensated else recording.command_unit
-    name = "deviation" if taken_off.any() else "displacement"
-    axes.set(xlabel=f"{_input_name(recording)}, {unit}", ylabel=f"{name}, µm")
 
 
 def _colours(loops: int) -> list[object]:

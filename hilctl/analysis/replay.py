@@ -117,14 +117,12 @@ class ReplayResult:
 def replay(
     recording: Recording | Iterable[Recording], model: HysteresisModel | None = None
 ) -> ReplayResult:
-    """Recompute every command.
+    """Recompute every command, perhaps with another model than the recorded one.
 
-    Args:
-        recording: The run, or its pieces in order for bounded memory
-            (:class:`hilctl.recording.reader.RecordingStream`). Pieces are read twice if the inverse
-            was bypassed, because the event may follow its samples.
-        model: Another model to invert instead of the recorded one; it starts at rest with the
-            reference advanced by its own preview, within the recorded limits.
+    For bounded memory, ``recording`` is the run's pieces in order
+    (:class:`hilctl.recording.reader.RecordingStream`). They are read twice if the inverse was
+    bypassed, because the event may follow its samples. Another model starts at rest with the
+    reference advanced by its own preview, within the recorded limits.
 
     Raises:
         DataError: The recording has no samples or lacks data for a replay, or ``model`` does not

@@ -125,10 +125,8 @@ class SafeStream(StandardStream):
 def safe_streams(*, acts: bool = False) -> Iterator[None]:
     """Escape control characters on standard output and error.
 
-    A write error does not change the exit code of a command that ``acts`` on an actuator.
-
-    Raises:
-        SystemExit: Standard output could not be written; the message is on standard error.
+    If standard output cannot be written, raise SystemExit with a message on standard error, except
+    for a command that ``acts`` on an actuator.
     """
     _open_missing()
     before = sys.stdout, sys.stderr

@@ -140,7 +140,11 @@ def compare(
         if not name.endswith(_FILES):
             entry(name)
     recorded = [read(path) for path in recordings]
-    data = _loops(recorded, points)
+    units = {recording.command_unit for recording in recorded}
+    if len(units) != 1:
+        raise InputError("recordings in A and in V cannot be combined")
+    loops = [loop for recording in recorded for loop in loops_from_pieces([recording], points)]
+    data = FitData(loops, units.pop())
     sources = tuple(path.name for path in recordings)
     device = _device(experiment, settings, frequencies_hz, recorded[0], data)
     rows: list[ComparedModel] = []
@@ -152,14 +156,6 @@ def compare(
         rows.append(_row(name, data, sources, recorded[0].sample_rate_hz, device, clock, tell))
     progress(1.0, "done")
     return Comparison(sources, device.description if device else "", data.loops, tuple(rows))
-
-
-def _loops(recordings: Sequence[Recording], points: int) -> FitData:
-    units = {recording.command_unit for recording in recordings}
-    if len(units) != 1:
-        raise InputError("recordings in A and in V cannot be combined")
-    loops = [loop for recording in recordings for loop in loops_from_pieces([recording], points)]
-    return FitData(loops, units.pop())
 
 
 def _row(

@@ -51,13 +51,9 @@ def _threads() -> ThreadPoolExecutor:
 def workers(scheduler: str = "none") -> Iterator[MapFunction]:
     """Yield a :data:`MapFunction`; results do not depend on the scheduler.
 
-    Args:
-        scheduler: ``none`` for serial, ``threads`` or ``processes`` on this machine,
-            or the address of a Dask scheduler, such as ``tcp://host:8786``. Its workers need the
-            same hilctl.
-
-    Raises:
-        InputError: The scheduler is unknown, can't be reached, or Dask is not installed.
+    It is ``none`` for serial, ``threads`` or ``processes`` on this machine, or the address of a
+    Dask scheduler, such as ``tcp://host:8786``, whose workers need the same hilctl. Raise
+    InputError if it is unknown, can't be reached, or Dask is not installed.
     """
     if scheduler == "none":
         yield map  # serial

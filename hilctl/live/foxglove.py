@@ -168,9 +168,7 @@ def _text(value: object) -> str:
 class FoxgloveServer:
     """Serves the active run on a port, 0 for any.
 
-    Raises:
-        InputError: The library is not installed.
-        RunError: The port is not available.
+    Raise InputError if the library is not installed, RunError if the port is not available.
     """
 
     def __init__(self, chosen: Callable[[list[RunFolder]], RunFolder | None], port: int) -> None:

@@ -136,31 +136,29 @@ MOST_PENDING = 64
 """Largest number of unauthenticated connections; the oldest is aborted."""
 
 
-class Admission:
-    """Accepts or refuses requests; the token has 32 hexadecimal digits."""
+def refusal(headers: Headers, token: str, *, upgrade: bool) -> tuple[HTTPStatus, str] | None:
+    """Return the reason to refuse a request for a file, or an upgrade, or None.
 
-    def __init__(self, token: str) -> None:
-        self._token = token
+    An upgrade needs the token, which has 32 hexadecimal digits.
+    """
+    hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
+    if len(hosts) != 1 or not _LOOPBACK.fullmatch(hosts[0].lower()):
+        return HTTPStatus.MISDIRECTED_REQUEST, "the host is not loopback"
+    if (origins or upgrade) and origins != [f"http://{hosts[0].lower()}"]:
+        return HTTPStatus.FORBIDDEN, "the origin is not this server"
+    if upgrade and not _has_token(headers, token):
+        return HTTPStatus.UNAUTHORIZED, "the token is missing or wrong"
+    return None
 
-    def refusal(self, headers: Headers, *, upgrade: bool) -> tuple[HTTPStatus, str] | None:
-        """Return the reason to refuse a request for a file or an upgrade, or None."""
-        hosts, origins = headers.get_all("Host"), headers.get_all("Origin")
-        if len(hosts) != 1 or not _LOOPBACK.fullmatch(hosts[0].lower()):
-            return HTTPStatus.MISDIRECTED_REQUEST, "the host is not loopback"
-        if (origins or upgrade) and origins != [f"http://{hosts[0].lower()}"]:
-            return HTTPStatus.FORBIDDEN, "the origin is not this server"
-        if upgrade and not self._has_token(headers):
-            return HTTPStatus.UNAUTHORIZED, "the token is missing or wrong"
-        return None
 
-    def _has_token(self, headers: Headers) -> bool:
-        lines = headers.get_all("Sec-WebSocket-Protocol")
-        try:
-            offered = [name for line in lines for name in parse_subprotocol(line)]
-        except InvalidHeader:
-            return False
-        tokens = [name[len(TOKEN_PREFIX) :] for name in offered if name.startswith(TOKEN_PREFIX)]
-        return len(tokens) == 1 and hmac.compare_digest(tokens[0].encode(), self._token.encode())
+def _has_token(headers: Headers, token: str) -> bool:
+    lines = headers.get_all("Sec-WebSocket-Protocol")
+    try:
+        offered = [name for line in lines for name in parse_subprotocol(line)]
+    except InvalidHeader:
+        return False
+    tokens = [name[len(TOKEN_PREFIX) :] for name in offered if name.startswith(TOKEN_PREFIX)]
+    return len(tokens) == 1 and hmac.compare_digest(tokens[0].encode(), token.encode())
 
 
 class PendingConnections:
@@ -265,7 +263,6 @@ class LiveServer:
         self._sockets = _listeners(port)
         self.port = int(self._sockets[0].getsockname()[1])
         self._token = secrets.token_hex(16)
-        self._admission = Admission(self._token)
         self._pending = PendingConnections()
         self._viewers: set[PageSession] = set()
         self._feeds = RunList(chosen)
@@ -297,7 +294,7 @@ class LiveServer:
 
     def _admit(self, connection: ServerConnection, request: Request) -> Response | None:
         upgrade = request.path == _LIVE
-        refused = self._admission.refusal(request.headers, upgrade=upgrade)
+        refused = refusal(request.headers, self._token, upgrade=upgrade)
         if refused is None and upgrade and len(self._viewers) >= _MOST_VIEWERS:
             refused = (HTTPStatus.SERVICE_UNAVAILABLE, "too many pages are connected")
         if request.method != "GET":

@@ -54,11 +54,8 @@ def serve_runs(
     """Serve the page, or Foxglove and compatible applications, until ``over`` returns true.
 
     ``chosen`` returns the run that a page shows by default. ``on_url`` gets the address, including
-    its token. ``port`` None is any port, and the default one of the applications.
-
-    Raises:
-        InputError: The library of Foxglove is not installed.
-        RunError: The port is not available.
+    its token. ``port`` None is any port, and the default one of the applications. Raise InputError
+    if the library of Foxglove is not installed, RunError if the port is not available.
     """
     # Below loop, recorder and guardian; before a library starts threads, which inherit it.
     be_ordinary()

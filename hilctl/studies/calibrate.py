@@ -68,8 +68,7 @@ class CalibrationFit:
 def sensor_points(path: Path, columns: tuple[Column, Column]) -> tuple[F64, F64]:
     """Return reading and true displacement of each row of a table, in um, by rising reading.
 
-    Raises:
-        DataError: A column is missing or not a length, or there are too few readings.
+    Raise DataError if a column is missing or not a length, or there are too few readings.
     """
     table = open_table(path)
     found = [table.index(column) for column in columns]
@@ -90,14 +89,8 @@ def sensor_points(path: Path, columns: tuple[Column, Column]) -> tuple[F64, F64]
 def fit_sensor(name: str, reading: F64, true: F64, origin: Origin) -> CalibrationFit:
     """Fit the curve of a sensor: the lowest order that the noise supports, or else a table.
 
-    Args:
-        name: Name of the data in messages.
-        reading: float64[n], in um, rising.
-        true: float64[n], in um.
-        origin: Origin of the calibration.
-
-    Raises:
-        DataError: The fitted displacement does not rise with the reading.
+    Readings rise; both are float64[n], in um. ``name`` is that of the data in messages. Raise
+    DataError if the fitted displacement does not rise with the reading.
     """
     fits = [
         _polynomial(reading, true, order)
@@ -154,9 +147,8 @@ def measure_amplifier(
 ) -> CalibrationFit:
     """Step the command within a tenth of its limits, and fit gain and offset of its read-back.
 
-    Raises:
-        InputError: The experiment is invalid, or its device does not measure; nothing has moved.
-        RunError: The run ended early.
+    Raise InputError if the experiment is invalid, or its device does not measure; nothing has
+    moved. Raise RunError if the run ended early.
     """
     settings = [*without_reference(experiment, settings), "condition=null"]
     loaded = load_experiment(experiment, settings)
@@ -217,8 +209,7 @@ def measure_amplifier(
 def existing_calibration(path: Path, part: str, *, overwrite: bool) -> CalibrationFile | None:
     """Return the calibration in the file to write, None without one.
 
-    Raises:
-        InputError: It has this part already, is something else, or cannot be written.
+    Raise InputError if it has this part already, is something else, or cannot be written.
     """
     if not path.exists():
         check_writable(path, overwrite=overwrite)

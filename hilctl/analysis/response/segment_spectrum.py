@@ -3,6 +3,7 @@
 import math
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
+from itertools import cycle
 from pathlib import Path
 from typing import Any
 
@@ -223,23 +224,23 @@ def spectrum_rows(found: SegmentSpectrum) -> Iterator[tuple[str, str]]:
 
 def spectrum_sheets(found: Sequence[SegmentSpectrum]) -> list[FigureSpec]:
     """Return figures of the density, the Allan deviation and the harmonics, those that apply."""
-    names = _names(found)
+    lines = [*zip(found, _names(found), cycle(NAMED), strict=False)]
 
     def draw_density(axes: Axes) -> None:
-        for each, name, colour in zip(found, names, _colours(len(found)), strict=True):
+        for each, name, colour in lines:
             hz, rms_um, largest_um = in_bands(each.frequency_hz, each.density_um, _BANDS)
             axes.fill_between(hz, _NM * rms_um, _NM * largest_um, color=colour, alpha=0.3)
             axes.plot(hz, _NM * rms_um, color=colour, label=name)
         _logarithmic(axes, "frequency, Hz", "density, nm/√Hz")
 
     def draw_allan(axes: Axes) -> None:
-        for each, name, colour in zip(found, names, _colours(len(found)), strict=True):
+        for each, name, colour in lines:
             if (rest := each.rest) is not None:
                 axes.plot(rest.averaging_s, _NM * rest.allan_um, color=colour, label=name)
         _logarithmic(axes, "averaging time, s", "Allan deviation, nm")
 
     def draw_harmonics(axes: Axes) -> None:
-        for each, name, colour in zip(found, names, _colours(len(found)), strict=True):
+        for each, name, colour in lines:
             if (sine := each.sine) is not None:
                 order = np.arange(1, sine.harmonics_um.size + 1)
                 axes.plot(order, _NM * sine.harmonics_um, "o", color=colour, label=name)
@@ -260,10 +261,6 @@ def spectrum_sheets(found: Sequence[SegmentSpectrum]) -> list[FigureSpec]:
         for applies, name, draw, caption in shown
         if applies
     ]
-
-
-def _colours(count: int) -> list[str]:
-    return [NAMED[number % len(NAMED)] for number in range(count)]
 
 
 def _names(found: Sequence[SegmentSpectrum]) -> list[str]:

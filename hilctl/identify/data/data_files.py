@@ -38,11 +38,9 @@ class TableRecord(NamedTuple):
 def read_table(path: Path, settings: TableSettings) -> TableRecord:
     """Read command and displacement from a table, see :func:`hilctl.base.table.open_table`.
 
-    Raises:
-        InputError: The file can't be read.
-        DataError: A column is unknown or has the wrong unit, a value is not a finite number (names
-            ``file:line``), time steps are uneven, or not exactly one of ``time_column`` and
-            ``rate_hz`` is set.
+    Raise DataError if a column is unknown or has the wrong unit, a value is not a finite number
+    (names ``file:line``), time steps are uneven, or not exactly one of ``time_column`` and
+    ``rate_hz`` is set.
     """
     table = open_table(path, settings.skip_rows)
     known = f"its columns are {', '.join(table.names)}"
@@ -219,10 +217,8 @@ def without_gaps(
     """Return every value of two columns in [start, stop), with gaps filled.
 
     The command is held, as the device holds its output in skipped ticks. The displacement in um is
-    interpolated: it approaches that of the held command, which the next sample still shows.
-
-    Raises:
-        DataError: More than 1 % of the samples are missing or have no displacement.
+    interpolated: it approaches that of the held command, which the next sample still shows. Raise
+    DataError if more than 1 % of the samples are missing or have no displacement.
     """
     samples = recording.samples.part(start, stop)
     signals = samples.index, samples.column(held), samples.column(interpolated)
@@ -248,12 +244,9 @@ def _filled(
 def history_from_pieces(pieces: Iterable[Recording]) -> History:
     """Return the whole waveform of a run from rest, without the ramp at its end.
 
-    Skipped samples are filled, see :func:`without_gaps`.
-
-    Raises:
-        DataError: Too many samples are missing, the command of a missing one is unknown, the run is
-            too long, or it begins with a ramp from another output, so that its initial state is
-            unknown.
+    Skipped samples are filled, see :func:`without_gaps`. Raise DataError if too many are missing,
+    the command of a missing one is unknown, the run is too long, or it begins with a ramp from
+    another output, so that its initial state is unknown.
     """
     indices: list[I64] = []
     command: list[F64] = []

@@ -330,17 +330,14 @@ def refine_runs(
     if reasons := tuple(data_reasons([*runs, *validate])):
         raise InputError("\n".join(reasons))
     parts, splits = parts_of(runs, validate)
-    rule = AcceptanceRule(_range_um(old, parts), tolerance_percent)
+    ends_um = old.output_range_um
+    runs_um = [run.displacement_um[run.ignore :] for run in parts]
+    range_um = float(np.ptp(ends_um) if ends_um else max(map(np.ptp, runs_um)))
+    rule = AcceptanceRule(range_um, tolerance_percent)
     choice, refined = Regularisation(old, parts, splits, rule).best(progress)
     progress(1.0, "done")
     named = refined.model_copy(update={"provenance": _provenance(old, runs, choice, source)})
     return Refinement(named, choice, tuple(choice.reasons))
-
-
-def _range_um(model: HysteresisModel, runs: Sequence[History]) -> float:
-    if model.output_range_um is not None:
-        return float(np.ptp(model.output_range_um))
-    return max(float(np.ptp(run.displacement_um[run.ignore :])) for run in runs)
 
 
 def _provenance(

@@ -166,8 +166,7 @@ def _heat_a2(each: PlannedStep, last: Path | None, now_s: float) -> float:
 def run_series(plan: CampaignPlan, host: StudyHost) -> CampaignResult:
     """Run the remaining steps of a campaign one after the other in real time.
 
-    Raises:
-        InputError: No disk space, or the table can't be written; nothing has moved.
+    Raise InputError without disk space, or if the table can't be written; nothing has moved.
     """
     require_room(plan.folder, plan.megabytes, plan.free_mb)
     state = Campaign(plan, host)

@@ -4,13 +4,13 @@ from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.files import TextFiles
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.preflight import check
 from hilctl.run.start import RunKey
-from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, base_problem, key_of, locs_of
+from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, key_of, locs_of
 from hilctl.studies.step_runner import free_mb
 
 _MOST_PROBLEMS = 20
@@ -79,7 +79,8 @@ def planned(
     ``heat_a2`` is the heat of the coil before the first step, in A^2; None for steps without real
     time, where kept steps heat the coil as well.
     """
-    files, problems = TextFiles(), _Problems(campaign)
+    files = TextFiles()
+    failed: list[tuple[CampaignStep, ConfigProblem]] = []
     left = {key: list(paths) for key, paths in completed.items()}
     known: dict[tuple[str, ...], PlannedStep] = {}
     steps: list[PlannedStep] = []
@@ -94,19 +95,15 @@ def planned(
                 each = _checked(each, known, folder)
             steps.append(each)
         except ConfigError as error:
-            problems.add(step, error.problems)
-    problems.refuse()
+            failed += [(step, problem) for problem in error.problems]
+    _refuse(campaign, failed)
     return CampaignPlan(campaign, folder, _cooling(campaign, steps, heat_a2), free_mb(folder))
 
 
 def _loaded(campaign: CampaignSteps, step: CampaignStep, files: TextFiles) -> PlannedStep:
-    try:
+    with campaign.base_read():
         settings = tuple(campaign.settings_for(step, files))
         loaded = campaign.load(step, files)
-    except ConfigError:
-        raise
-    except InputError as error:
-        raise base_problem(campaign, error) from None
     return PlannedStep(step, loaded, settings, RunKey.of(loaded))
 
 
@@ -142,40 +139,28 @@ def _cooling(
     return tuple(found)
 
 
-class _Problems:
-    """Problems of many steps, each listed once with its location in the campaign file."""
-
-    def __init__(self, campaign: CampaignSteps) -> None:
-        self._campaign = campaign
-        self._found: dict[tuple[str, str, str], tuple[ConfigProblem, list[CampaignStep]]] = {}
-
-    def add(self, step: CampaignStep, problems: Sequence[ConfigProblem]) -> None:
-        """Add the problems of a step."""
-        for problem in problems:
-            moved = replace(problem, where=self._where(step, problem))
-            known = self._found.setdefault((moved.where, moved.key, moved.rule), (moved, []))
-            known[1].append(step)
-
-    def refuse(self) -> None:
-        """Raise ConfigError if there are problems."""
-        if self._found:
-            raise ConfigError(
-                replace(problem, hint="; ".join(filter(None, (problem.hint, self._whom(steps)))))
-                for problem, steps in list(self._found.values())[:_MOST_PROBLEMS]
-            )
-
-    def _whom(self, steps: Sequence[CampaignStep]) -> str:
-        if len(steps) == len(self._campaign.steps):
-            return "in every step"
+def _refuse(campaign: CampaignSteps, failed: Sequence[tuple[CampaignStep, ConfigProblem]]) -> None:
+    """Raise ConfigError if steps failed, with each problem once, located in the campaign file."""
+    found: dict[tuple[str, str, str], tuple[ConfigProblem, list[CampaignStep]]] = {}
+    for step, problem in failed:
+        moved = replace(problem, where=_where(campaign, step, problem))
+        found.setdefault((moved.where, moved.key, moved.rule), (moved, []))[1].append(step)
+    problems = []
+    for problem, steps in list(found.values())[:_MOST_PROBLEMS]:
         more = f" and {len(steps) - 1} more" if len(steps) > 1 else ""
-        return f"in {steps[0].text}{more}"
+        every = len(steps) == len(campaign.steps)
+        whom = "in every step" if every else f"in {steps[0].text}{more}"
+        problems.append(replace(problem, hint="; ".join(filter(None, (problem.hint, whom)))))
+    if problems:
+        raise ConfigError(problems)
 
-    def _where(self, step: CampaignStep, problem: ConfigProblem) -> str:
-        """Return the location of a value; values of a step are in the campaign file."""
-        if not problem.where.startswith("--set "):
-            return problem.where
-        key, document = key_of(problem.where.removeprefix("--set ")), self._campaign.document
-        places = [*locs_of(self._campaign.config, key), ("set", key), (key,)]
-        if step.is_reference:
-            places.insert(-1, ("reference_run", "set", key))
-        return next((document.where(loc) for loc in places if document.holds(loc)), problem.where)
+
+def _where(campaign: CampaignSteps, step: CampaignStep, problem: ConfigProblem) -> str:
+    """Return the location of a value; values of a step are in the campaign file."""
+    if not problem.where.startswith("--set "):
+        return problem.where
+    key, document = key_of(problem.where.removeprefix("--set ")), campaign.document
+    places = [*locs_of(campaign.config, key), ("set", key), (key,)]
+    if step.is_reference:
+        places.insert(-1, ("reference_run", "set", key))
+    return next((document.where(loc) for loc in places if document.holds(loc)), problem.where)

@@ -6,6 +6,7 @@ import random
 import re
 import zlib
 from collections.abc import Iterable, Iterator, Mapping, Sequence
+from contextlib import contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Annotated, Any, Literal, TypeAlias
@@ -210,6 +211,16 @@ class CampaignSteps:
     keys: tuple[str, ...]  # the varied keys
     steps: tuple[CampaignStep, ...]  # the steps in order
 
+    @contextmanager
+    def base_read(self) -> Iterator[None]:
+        """Raise ConfigError, located in the campaign file, if the base can't be read meanwhile."""
+        try:
+            yield
+        except ConfigError:
+            raise
+        except InputError as error:
+            raise ConfigError([self.document.problem("experiment", str(error))]) from None
+
     def load(self, step: CampaignStep, files: TextFiles) -> LoadedExperiment:
         """Return the experiment of a step; raise InputError if it can't be read or is invalid."""
         document = load_document(self.experiment, files)
@@ -234,9 +245,7 @@ class CampaignSteps:
 def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
     """Read a campaign file, with ``key=value`` texts over its base experiment.
 
-    Raises:
-        InputError: It can't be read.
-        ConfigError: The file is invalid; all problems are listed.
+    Raise InputError if it can't be read, ConfigError with all problems if it is invalid.
     """
     return campaign_of(load_document(path), path.parent, settings)
 
@@ -308,8 +317,3 @@ def cell(value: Any) -> Any:
     if value is None or isinstance(value, str | int | float):
         return value
     return json.dumps(value, ensure_ascii=False)
-
-
-def base_problem(campaign: CampaignSteps, error: InputError) -> ConfigError:
-    """Return the error for a base experiment that can't be read."""
-    return ConfigError([campaign.document.problem("experiment", str(error))])

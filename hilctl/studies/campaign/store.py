@@ -7,7 +7,7 @@ from pathlib import Path
 
 from mcap.writer import MCAP0_MAGIC
 
-from hilctl.base.errors import ConfigError, DataError, InputError
+from hilctl.base.errors import DataError, InputError
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
 from hilctl.experiment.file import RecordingConfig
 from hilctl.experiment.load import document_with
@@ -16,7 +16,7 @@ from hilctl.recording.recover import recover_recording
 from hilctl.recording.run_summary import read_ends, recordings_in
 from hilctl.run.run_folder import runs
 from hilctl.run.start import RunKey, completed_key
-from hilctl.studies.campaign.steps import CampaignSteps, base_problem, settings_of
+from hilctl.studies.campaign.steps import CampaignSteps, settings_of
 
 _LONGEST_WAIT_S = 60.0
 _POLL_S = 0.1
@@ -27,13 +27,9 @@ def campaign_folder(campaign: CampaignSteps) -> Path:
     config = campaign.config
     if config.folder is not None:
         return Path(config.folder)
-    try:
+    with campaign.base_read():
         settings = (*campaign.settings, *settings_of(config.set))
         document = document_with(campaign.experiment, settings)
-    except ConfigError:
-        raise
-    except InputError as error:
-        raise base_problem(campaign, error) from None
     given = document.value(("recording", "folder"))
     return Path(given if isinstance(given, str) else RecordingConfig().folder) / config.name
 

@@ -93,8 +93,7 @@ class CharacterisationPlan:
 class CharacterisationRunner:
     """Characterise the device of an experiment; its waveform and compensator are not used.
 
-    Raises:
-        InputError: The experiment is invalid, or a real device is to run without real time.
+    Raise InputError if it is invalid, or a real device is to run without real time.
     """
 
     def __init__(
@@ -231,9 +230,8 @@ class CharacterisationRunner:
     def _kept(self, path: Path, settings: list[str]) -> Recording | None:
         """Return the recording of a step that is done; otherwise None.
 
-        Raises:
-            InputError: It was recorded with other settings, not as a consequence of an earlier
-                step that was run again.
+        Raise InputError if it was recorded with other settings, not as a consequence of an earlier
+        step that was run again.
         """
         if not path.exists():
             return None

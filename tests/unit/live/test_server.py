@@ -21,12 +21,12 @@ from hilctl.live.server import (
     MOST_PENDING,
     PROTOCOL,
     SLOW_S,
-    Admission,
     LiveServer,
     PageSession,
     PageView,
     PendingConnections,
     file_response,
+    refusal,
 )
 from tests.fakes import SteppingClock
 from tests.unit.live.conftest import CONFIGS, active_run, first
@@ -291,20 +291,20 @@ HOST, ORIGIN = f"127.0.0.1:{PORT}", f"http://127.0.0.1:{PORT}"
 OFFER = f"{PROTOCOL}, token.{TOKEN}"
 
 
-def refusal(upgrade=True, **given):
+def refused(upgrade=True, **given):
     headers = Headers()
     for name, values in given.items():
         for value in [values] if isinstance(values, str) else values:
             headers[name.replace("_", "-")] = value
-    found = Admission(TOKEN).refusal(headers, upgrade=upgrade)
+    found = refusal(headers, TOKEN, upgrade=upgrade)
     return found and found[0].value
 
 
 @pytest.mark.parametrize("host", [HOST, f"[::1]:{PORT}", f"localhost:{PORT}", "localhost:9000"])
 def test_page_with_token_is_accepted(host):
     """On any port: an SSH tunnel may have another."""
-    assert not refusal(Host=host, Origin=f"http://{host}", Sec_WebSocket_Protocol=OFFER)
-    assert not refusal(upgrade=False, Host=host)
+    assert not refused(Host=host, Origin=f"http://{host}", Sec_WebSocket_Protocol=OFFER)
+    assert not refused(upgrade=False, Host=host)
 
 
 @pytest.mark.parametrize(
@@ -313,7 +313,7 @@ def test_page_with_token_is_accepted(host):
 @pytest.mark.parametrize("upgrade", [True, False])
 def test_a_foreign_host_is_refused(host, upgrade):
     """DNS rebinding in particular."""
-    assert refusal(upgrade, Host=host, Origin=ORIGIN, Sec_WebSocket_Protocol=OFFER) == 421
+    assert refused(upgrade, Host=host, Origin=ORIGIN, Sec_WebSocket_Protocol=OFFER) == 421
 
 
 @pytest.mark.parametrize(
@@ -328,11 +328,11 @@ def test_a_foreign_host_is_refused(host, upgrade):
     ],
 )
 def test_a_foreign_origin_is_refused(origin):
-    assert refusal(Host=HOST, Origin=origin, Sec_WebSocket_Protocol=OFFER) == 403
+    assert refused(Host=HOST, Origin=origin, Sec_WebSocket_Protocol=OFFER) == 403
 
 
 def test_foreign_page_gets_no_file():
-    assert refusal(upgrade=False, Host=HOST, Origin="http://evil.example") == 403
+    assert refused(upgrade=False, Host=HOST, Origin="http://evil.example") == 403
 
 
 WRONG = ("token.", f"token.{TOKEN[:-1]}", f"token.{TOKEN}0", f"token.{'0' * 32}, token.{TOKEN}")
@@ -342,7 +342,7 @@ WRONG = ("token.", f"token.{TOKEN[:-1]}", f"token.{TOKEN}0", f"token.{'0' * 32},
     "offer", [[], PROTOCOL, "a b, ;", *(f"{PROTOCOL}, {token}" for token in (*WRONG, TOKEN))]
 )
 def test_missing_or_wrong_token_is_refused(offer):
-    assert refusal(Host=HOST, Origin=ORIGIN, Sec_WebSocket_Protocol=offer) == 401
+    assert refused(Host=HOST, Origin=ORIGIN, Sec_WebSocket_Protocol=offer) == 401
 
 
 def test_oldest_pending_connection_is_aborted():
