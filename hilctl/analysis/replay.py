@@ -7,7 +7,7 @@ M(u') = reference. To first order in u' - u, their error is y - M(u), sensor noi
 
 import math
 from collections.abc import Callable, Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from functools import partial
 from itertools import pairwise
 from typing import Any
@@ -83,7 +83,7 @@ class ErrorPrediction:
         return PredictedError(peaks[0], rms[0], peaks[1], rms[1])
 
 
-@dataclass(frozen=True, slots=True)
+@dataclass(slots=True)
 class ReplayResult:
     """Comparison of recomputed and recorded commands.
 
@@ -197,10 +197,11 @@ class _Running:
         """Return the comparison, after the last piece."""
         if self._waiting is not None:
             self._go(self._waiting, self._waiting.index.size)
-        if not self._any_start or self._comparison.compared == 0:
+        found = self._comparison.result
+        if not self._any_start or found.samples == 0:
             raise DataError(f"{self._path}: holds no samples to replay")
-        predicted = None if self._prediction is None else self._prediction.result()
-        return replace(self._comparison.result(), predicted=predicted)
+        found.predicted = None if self._prediction is None else self._prediction.result()
+        return found
 
     def _go(self, samples: Samples, ready: int) -> None:
         """Recompute the rows before ``ready``."""
@@ -353,18 +354,17 @@ def _alike(flags: U32, rows: slice) -> list[slice]:
 class _Comparison:
     """Comparison of recomputed and recorded commands, accumulated over pieces."""
 
-    def __init__(self, command_unit: str) -> None:
-        self._unit = command_unit
-        self.compared = self._left_out = self._differing = self._limited = 0
-        self._first: int | None = None
-        self._largest = self._squares = 0.0
-        self._lowest, self._highest = math.inf, -math.inf
+    def __init__(self, unit: str) -> None:
+        most = math.inf
+        self.result = ReplayResult(0, 0, True, None, 0, 0.0, 0.0, unit, most, -most, 0)
+        self._squares = 0.0
 
     def add(
         self, samples: Samples, known: npt.NDArray[np.bool_], recomputed: tuple[F64, F64, U32]
     ) -> None:
+        found = self.result
         if not known.all():
-            self._left_out += int(np.count_nonzero(~known))
+            found.left_out_samples += int(np.count_nonzero(~known))
             samples = samples.rows(known)
             recomputed = recomputed[0][known], recomputed[1][known], recomputed[2][known]
         if samples.index.size == 0:
@@ -376,30 +376,17 @@ class _Comparison:
             & (flags == samples.flags & np.uint32(_LIMIT_BITS))
         )
         different = np.flatnonzero(~same)
-        if different.size and self._first is None:
-            self._first = int(samples.index[different[0]])
+        if different.size and found.identical:
+            found.identical, found.first_difference = False, int(samples.index[different[0]])
         with np.errstate(over="ignore", invalid="ignore"):  # of commands near the largest number
             change = command - samples.command
             self._squares += float(np.sum(change**2))
-        self._differing += different.size
-        self._largest = float(np.maximum(self._largest, np.max(np.abs(change))))
-        self._lowest = min(self._lowest, float(command.min()))
-        self._highest = max(self._highest, float(command.max()))
+        found.differing_samples += different.size
+        largest = np.maximum(found.largest_difference, np.max(np.abs(change)))
+        found.largest_difference = float(largest)
+        found.command_min = min(found.command_min, float(command.min()))
+        found.command_max = max(found.command_max, float(command.max()))
         limited = flags & np.uint32(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED)
-        self._limited += int(np.count_nonzero(limited))
-        self.compared += command.size
-
-    def result(self) -> ReplayResult:
-        return ReplayResult(
-            samples=self.compared,
-            left_out_samples=self._left_out,
-            identical=self._differing == 0,
-            first_difference=self._first,
-            differing_samples=self._differing,
-            largest_difference=self._largest,
-            rms_difference=math.sqrt(self._squares / self.compared),
-            command_unit=self._unit,
-            command_min=self._lowest,
-            command_max=self._highest,
-            limited_samples=self._limited,
-        )
+        found.limited_samples += int(np.count_nonzero(limited))
+        found.samples += command.size
+        found.rms_difference = math.sqrt(self._squares / found.samples)

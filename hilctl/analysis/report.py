@@ -146,20 +146,26 @@ class RunReportBuilder:
 
     def report(self) -> RunReport:
         """Return the report, after the last piece."""
-        segments = tuple(segment.report() for segment in self._segments)
+        segments, ticks, last = tuple(s.report() for s in self._segments), self._ticks, self._last
         adapted = [event.values for event in self._events if event.code == ADAPTED]
         lost = [event.values["readings"] for event in self._events if event.code == LOST_READINGS]
         zeros = [event.values["offset_um"] for event in self._events if event.code == ZERO]
         return RunReport(
-            **_identity(self._last),
+            **_identity(last),
             **self._counted(),
             **_worst(segments),
-            **self._timing(),
+            deadline_misses=tick_lateness.misses(last, ticks.late_ns.size),
+            skipped_ticks=tick_lateness.counter(last, "skipped_ticks"),
+            late_ticks=tick_lateness.counter(last, "late_ticks"),
+            lateness_us=tick_lateness.percentiles_us(ticks.late_ns),
+            lateness_by_minute=ticks.by_minute(),
+            exchange_us=tick_lateness.percentiles_us(ticks.exchange_ns),
+            processes=processes_of(last),
             adapted=dict(adapted[-1]) if adapted else {},
             lost_readings=round(sum(lost)),
             zero_um=zeros[-1] if zeros else None,
             marks=tuple(
-                (event.sample / self._last.sample_rate_hz, event.text)
+                (event.sample / last.sample_rate_hz, event.text)
                 for event in self._events
                 if event.code == MARK
             ),
@@ -189,18 +195,6 @@ class RunReportBuilder:
                 )
                 for channel, each in zip(self._last.aux_channels, self._aux, strict=True)
             },
-        }
-
-    def _timing(self) -> dict[str, Any]:
-        ticks, last = self._ticks, self._last
-        return {
-            "deadline_misses": tick_lateness.misses(last, ticks.late_ns.size),
-            "skipped_ticks": tick_lateness.counter(last, "skipped_ticks"),
-            "late_ticks": tick_lateness.counter(last, "late_ticks"),
-            "lateness_us": tick_lateness.percentiles_us(ticks.late_ns),
-            "lateness_by_minute": ticks.by_minute(),
-            "exchange_us": tick_lateness.percentiles_us(ticks.exchange_ns),
-            "processes": processes_of(last),
         }
 
 

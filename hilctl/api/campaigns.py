@@ -26,15 +26,15 @@ from hilctl.studies.calibrate import (
 )
 from hilctl.studies.campaign.campaign_runner import (
     CampaignResult,
+    planned_fast,
     planned_in_real_time,
     prepared,
+    run_fast,
     run_series,
 )
-from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
 from hilctl.studies.campaign.plan import CampaignPlan
 from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, load_campaign
-from hilctl.studies.campaign.store import campaign_folder
-from hilctl.studies.campaign.table import CampaignRow
+from hilctl.studies.campaign.store import CampaignRow, campaign_folder
 from hilctl.studies.characterise.characterisation_runner import (
     CharacterisationPlan,
     CharacterisationRunner,

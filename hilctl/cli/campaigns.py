@@ -42,7 +42,7 @@ from hilctl.studies.campaign.steps import (
     cell,
     load_campaign,
 )
-from hilctl.studies.campaign.table import CampaignRow
+from hilctl.studies.campaign.store import CampaignRow
 from hilctl.studies.multi_run.collect import COMPLETED
 from hilctl.studies.multi_run.varied_parameter import (
     VariedParameter,

@@ -92,7 +92,12 @@ def demo(
             "deadline_misses": result.deadline_misses,
         }
         if not as_json:
-            _print_demo_run(which, results[which], result.reason)
+            percent = report.peak_hysteresis_percent
+            value = "no value" if percent is None else f"{percent:.2f} % peak hysteresis"
+            print(f"{which + ' the inverse':20} {value:28} {result.code}: {result.reason}")
+            if result.deadline_misses:
+                print(f"{'':20} {result.deadline_misses}")
+            print(f"{'':20} {page}")
     if as_json:
         print_json(results)
     else:
@@ -101,15 +106,6 @@ def demo(
         print(f"  hilctl run {own}\n  hilctl examples")
     if any(each["code"] == "fault" for each in results.values()):
         raise typer.Exit(3)
-
-
-def _print_demo_run(which: str, result: dict[str, Any], reason: str) -> None:
-    hysteresis = result["peak_hysteresis_percent"]
-    value = "no value" if hysteresis is None else f"{hysteresis:.2f} % peak hysteresis"
-    print(f"{which + ' the inverse':20} {value:28} {result['code']}: {reason}")
-    if result["deadline_misses"]:
-        print(f"{'':20} {result['deadline_misses']}")
-    print(f"{'':20} {result['page']}")
 
 
 def init(

@@ -2,7 +2,6 @@
 
 import json
 import sys
-from collections.abc import Sequence
 from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated
@@ -10,7 +9,7 @@ from typing import Annotated
 import typer
 
 from hilctl import api
-from hilctl.analysis.catalogue import Entry, keys_of, read_catalogue, select
+from hilctl.analysis.catalogue import keys_of, read_catalogue, select
 from hilctl.analysis.export import export_all
 from hilctl.api.tables import RunTable
 from hilctl.base.errors import InputError
@@ -46,20 +45,11 @@ def list_(
         print("\n".join(map(printable, keys_of(catalogue))))
         return
     entries = RunTable(select(catalogue, where, sort, reverse=reverse))
-    if as_json:
-        _print_json(entries, len(catalogue), folder)
-    else:
-        _print_table(entries, len(catalogue))
-
-
-def _print_json(entries: Sequence[Entry], count: int, folder: Path) -> None:
-    """Print one JSON object with one line per recording (indentation would take seconds)."""
-    lines = ",\n".join(map(finite_json, entries))
-    head = f'"folder": {json.dumps(str(folder))}, "of": {count}'
-    print(f'{{{head}, "recordings": [\n{lines}\n]}}')
-
-
-def _print_table(entries: RunTable, count: int) -> None:
+    if as_json:  # one line per recording, because indentation would take seconds
+        lines = ",\n".join(map(finite_json, entries))
+        head = f'"folder": {json.dumps(str(folder))}, "of": {len(catalogue)}'
+        print(f'{{{head}, "recordings": [\n{lines}\n]}}')
+        return
     if entries:
         print("\n".join(entries.lines()))
     problems = [entry for entry in entries if entry["problem"]]
@@ -67,7 +57,7 @@ def _print_table(entries: RunTable, count: int) -> None:
         where = printable(entry["path"])
         print(f"hilctl: {where}: {printable(entry['problem'])}", file=sys.stderr)
     unreadable = f", {len(problems)} of them unreadable" if problems else ""
-    print(f"{len(entries)} of {count} recordings{unreadable}")
+    print(f"{len(entries)} of {len(catalogue)} recordings{unreadable}")
 
 
 def export(

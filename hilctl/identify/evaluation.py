@@ -60,11 +60,8 @@ class Evaluation:
     @property
     def stroke_percent(self) -> float:
         """Geometric mean of the errors by stroke, so that each class counts alike."""
-        return float(
-            np.exp(
-                np.mean([math.log(max(each.rms_percent, TINY_PERCENT)) for each in self.classes])
-            )
-        )
+        logs = [math.log(max(each.rms_percent, TINY_PERCENT)) for each in self.classes]
+        return float(np.exp(np.mean(logs)))
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the errors as plain mappings, lists and numbers, for JSON."""

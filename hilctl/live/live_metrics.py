@@ -76,8 +76,12 @@ class Headroom:
                 self._most(each.name, traces.values[row], each.high, each.unit)
             elif each.high is not None:
                 self._range(each.name, traces.values[row], [each.low, each.high], each.unit)
-        if limits.rms_current_a is not None:
-            self._warm(np.fmax(np.abs(command), np.abs(measured)))
+        if limits.thermal_time_constant_s is not None:
+            current_a = np.fmax(np.abs(command), np.abs(measured))
+            stays = math.exp(-1.0 / (limits.thermal_time_constant_s * self._rate_hz))
+            weights = stays ** np.arange(current_a.size - 1, -1, -1)
+            heat_a2 = (1.0 - stays) * float(np.nansum(weights * np.square(current_a)))
+            self._heat_a2 = self._heat_a2 * stays**current_a.size + heat_a2
 
     def gauges(self, late_s: float) -> list[Gauge]:
         """Return the gauges; ``late_s`` is the largest lateness of the newest ticks."""
@@ -122,14 +126,6 @@ class Headroom:
             command = np.concatenate((self._before[1:], command))
         self._before = newest
         return np.diff(command) / np.diff(index) * self._rate_hz
-
-    def _warm(self, current_a: F64) -> None:
-        time_s = self._limits.thermal_time_constant_s
-        assert time_s is not None
-        stays = math.exp(-1.0 / (time_s * self._rate_hz))
-        weights = stays ** np.arange(current_a.size - 1, -1, -1)
-        heat_a2 = (1.0 - stays) * float(np.nansum(weights * np.square(current_a)))
-        self._heat_a2 = self._heat_a2 * stays**current_a.size + heat_a2
 
 
 FigureValues: TypeAlias = dict[str, float | None]

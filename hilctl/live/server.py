@@ -161,41 +161,22 @@ def _has_token(headers: Headers, token: str) -> bool:
     return len(tokens) == 1 and hmac.compare_digest(tokens[0].encode(), token.encode())
 
 
-class PendingConnections:
-    """Connections that are not authenticated yet; the oldest is aborted if there are too many."""
-
-    def __init__(self, most: int = MOST_PENDING) -> None:
-        self._most = most
-        self._abort: dict[object, Callable[[], None]] = {}
-
-    def add(self, connection: object, abort: Callable[[], None]) -> None:
-        """Add a connection; ``abort`` closes it."""
-        while len(self._abort) >= self._most:
-            self._abort.pop(next(iter(self._abort)))()
-        self._abort[connection] = abort
-
-    def remove(self, connection: object) -> None:
-        """Remove a connection that is authenticated or closed."""
-        self._abort.pop(connection, None)
-
-    def __len__(self) -> int:
-        return len(self._abort)
-
-
-def bounded(pending: PendingConnections) -> type[ServerConnection]:
-    """Return a connection class that is registered as pending until it is authenticated."""
+def bounded(pending: dict[ServerConnection, Callable[[], None]]) -> type[ServerConnection]:
+    """Return a connection class that is in ``pending``, with its abort, until it is removed."""
 
     class BoundedConnection(ServerConnection):
         """A connection that may be aborted until it is authenticated."""
 
         def connection_made(self, transport: asyncio.BaseTransport) -> None:
-            """Register the connection; the oldest pending one may be aborted."""
+            """Register the connection, and abort the oldest ones if there are too many."""
             super().connection_made(transport)
-            pending.add(self, self.transport.abort)
+            while len(pending) >= MOST_PENDING:
+                pending.pop(next(iter(pending)))()
+            pending[self] = self.transport.abort
 
         def connection_lost(self, exc: Exception | None) -> None:
             """Unregister the connection."""
-            pending.remove(self)
+            pending.pop(self, None)
             super().connection_lost(exc)
 
     return BoundedConnection
@@ -263,7 +244,7 @@ class LiveServer:
         self._sockets = _listeners(port)
         self.port = int(self._sockets[0].getsockname()[1])
         self._token = secrets.token_hex(16)
-        self._pending = PendingConnections()
+        self._pending: dict[ServerConnection, Callable[[], None]] = {}  # not authenticated yet
         self._viewers: set[PageSession] = set()
         self._feeds = RunList(chosen)
         self._reports: dict[str, bytes] = {}
@@ -275,6 +256,9 @@ class LiveServer:
 
     async def run(self, over: Callable[[RunList], bool]) -> None:
         """Serve until ``over`` returns true."""
+        quiet = logging.getLogger(f"{__name__}.requests")  # discards messages on invalid requests
+        quiet.propagate = False
+        quiet.addHandler(logging.NullHandler())
         settings: dict[str, Any] = {
             "process_request": self._admit,
             "subprotocols": [PROTOCOL],  # never the token, which is offered too
@@ -285,7 +269,7 @@ class LiveServer:
             "max_size": MAX_MESSAGE_BYTES,
             "max_queue": 4,
             "create_connection": bounded(self._pending),
-            "logger": _quiet(),
+            "logger": quiet,
         }
         async with AsyncExitStack() as stack:
             for listener in self._sockets:
@@ -306,7 +290,7 @@ class LiveServer:
             if path in self._reports:
                 return _response(HTTPStatus.OK, HTML, self._reports[path], _REPORT_POLICY)
             return file_response(path)
-        self._pending.remove(connection)
+        self._pending.pop(connection, None)
         return None
 
     async def _serve_page(self, connection: ServerConnection) -> None:
@@ -396,14 +380,6 @@ class LiveServer:
                 "signals": [[each.name, each.label, each.unit] for each in feed.signals],
             }
         return finite_json(state)
-
-
-def _quiet() -> logging.Logger:
-    """Return a log that discards messages on invalid requests."""
-    log = logging.getLogger(f"{__name__}.requests")
-    log.propagate = False
-    log.addHandler(logging.NullHandler())
-    return log
 
 
 def _listeners(port: int) -> list[socket.socket]:

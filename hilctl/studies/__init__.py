@@ -8,8 +8,7 @@ multi_run/      reports of many runs
 """
 
 PUBLIC = (
-    "calibrate", "campaign.campaign_runner", "campaign.parallel_simulation", "campaign.plan",
-    "campaign.steps", "campaign.store", "campaign.table",
+    "calibrate", "campaign.campaign_runner", "campaign.plan", "campaign.steps", "campaign.store",
     "characterise.characterisation_runner", "characterise.results", "characterise.rig_page",
     "multi_run.collect", "multi_run.multi_run_page", "multi_run.plots", "multi_run.trend",
     "multi_run.varied_parameter", "step_runner",

@@ -16,8 +16,7 @@ import numpy as np
 import pytest
 
 from hilctl.recording.reader import read
-from hilctl.studies.campaign.campaign_runner import StudyHost
-from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
+from hilctl.studies.campaign.campaign_runner import StudyHost, planned_fast, run_fast
 from hilctl.studies.campaign.steps import load_campaign
 from hilctl.studies.multi_run import trend
 from hilctl.studies.multi_run.collect import collect

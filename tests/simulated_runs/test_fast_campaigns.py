@@ -1,8 +1,7 @@
 """Campaigns without real time over several processes: the same as in one."""
 
 from hilctl.recording.reader import read
-from hilctl.studies.campaign.campaign_runner import StudyHost
-from hilctl.studies.campaign.parallel_simulation import planned_fast, run_fast
+from hilctl.studies.campaign.campaign_runner import StudyHost, planned_fast, run_fast
 from hilctl.studies.campaign.steps import load_campaign
 from tests.unit.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 

@@ -149,11 +149,8 @@ def _spectrum(recording: Recording, segment: Segment) -> SegmentSpectrum | None:
     rest = segment.kind == "hold" or not np.ptp(samples.command) > 0.0
     if not sine and not rest:
         return None
-    start, stop, rate_hz = (
-        int(samples.index[0]),
-        int(samples.index[-1]) + 1,
-        recording.sample_rate_hz,
-    )
+    start, stop = int(samples.index[0]), int(samples.index[-1]) + 1
+    rate_hz = recording.sample_rate_hz
     _, values_um = without_gaps(replace(recording, samples=samples), start, stop)
     hz, density_um, median_um = density(values_um, rate_hz, round(_LINE_CYCLES * segment.period))
     return SegmentSpectrum(

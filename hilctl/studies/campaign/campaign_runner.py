@@ -1,30 +1,46 @@
-"""Campaign runner: completed steps are kept, failed ones marked; a fault of the rig ends it."""
+"""Campaigns in real time, or of simulated runs in parallel processes or on a Dask cluster.
 
-from collections.abc import Iterator
+Completed steps are kept, failed ones marked; a fault of the rig ends a campaign. A worker receives
+the checked texts of a simulated run and returns the recording as bytes, so it does not need access
+to the campaign's folder. The coil starts each such run with the heat that it would have if the
+steps and their pauses followed each other.
+"""
+
+import tempfile
+from collections.abc import Iterator, Mapping
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 
-from hilctl.base.errors import ConfigError, DataError, InputError, RunError
+from hilctl.base.errors import ConfigError, DataError, HilctlError, InputError, RunError
+from hilctl.base.files import TextFiles, write_file
 from hilctl.base.formatting import shown_briefly
+from hilctl.base.yaml import Document
 from hilctl.experiment.coil_heat import CoolingCoil
 from hilctl.experiment.device_state import heat_after, heat_before
+from hilctl.experiment.load import resolve
+from hilctl.experiment.preflight import check
+from hilctl.identify.parallel import workers
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.result import RunResult
 from hilctl.run.start import RunKey, StepStoppedError
+from hilctl.run.unpaced import run_unpaced
 from hilctl.studies.campaign.plan import CampaignPlan, PlannedStep, planned
 from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps
 from hilctl.studies.campaign.store import (
+    CampaignRow,
     await_runs,
     completed_runs,
+    entry_of,
     last_started,
     locked_folder,
     new_recording,
+    ordered,
     repair_recordings,
+    write_table,
 )
-from hilctl.studies.campaign.table import CampaignRow, entry_of, ordered, write_table
 from hilctl.studies.multi_run.collect import COMPLETED, series_of
 from hilctl.studies.multi_run.digest import SeriesDrift, digest_of, drift_of
 from hilctl.studies.multi_run.multi_run_page import write_series
@@ -74,7 +90,7 @@ class CampaignResult:
 
 
 class Campaign:
-    """State of a running campaign: its rows, table and page.
+    """State of a running campaign, with the steps that are done already: rows, table and page.
 
     The table is written after every step. Drawing the page takes seconds: it is written at the end,
     and between steps while that takes a small part of the time.
@@ -87,13 +103,11 @@ class Campaign:
         self._page: Path | None = None
         self._host = host
         self._next_page_s = host.now_s() + _FIRST_PAGE_S
-
-    def keep(self) -> None:
-        """Add the rows of steps that are done already."""
-        for each in self.plan.steps:
+        require_room(plan.folder, plan.megabytes, plan.free_mb)
+        for each in plan.steps:
             if each.kept is not None:
                 self.add(each, replace(measured(read(each.kept)), kept=True), write=False)
-        self.tables = write_table(self.plan, self.rows)
+        self.tables = write_table(plan, self.rows)
 
     def add(self, each: PlannedStep, row: CampaignRow, *, write: bool = True) -> None:
         """Add the row of a step and rewrite the table."""
@@ -168,9 +182,7 @@ def run_series(plan: CampaignPlan, host: StudyHost) -> CampaignResult:
 
     Raise InputError without disk space, or if the table can't be written; nothing has moved.
     """
-    require_room(plan.folder, plan.megabytes, plan.free_mb)
     state = Campaign(plan, host)
-    state.keep()
     steps = _Steps(state, host)
     try:
         for each in plan.left:
@@ -256,3 +268,73 @@ def is_harmless(result: RunResult) -> bool:
         return False
     codes = {event.code for event in events if event.level == "error"} - {"run_ended"}
     return bool(codes) and codes <= HARMLESS
+
+
+@dataclass(frozen=True, slots=True)
+class FastTask:
+    """Input of one run."""
+
+    experiment: str  # the experiment as YAML
+    files: Mapping[str, str]  # texts of the files it uses, by absolute path
+    folder: str  # folder that its file names are relative to
+    heat_a2: float  # heat of the coil before it, in A^2
+
+
+def run_task(task: FastTask) -> tuple[bytes, CampaignRow, bool]:
+    """Run one step on a worker.
+
+    Return its recording, which is empty if it was refused, its row, and whether the next step may
+    run.
+    """
+    document = Document("experiment", task.experiment)
+    loaded = resolve(document, Path(task.folder), files=TextFiles(task.files))
+    with tempfile.TemporaryDirectory(prefix="hilctl-campaign-") as folder:
+        output = Path(folder) / "run.mcap"
+        try:
+            result = run_unpaced(check(loaded, task.heat_a2), output)
+        except HilctlError as error:
+            return b"", CampaignRow(f"refused: {error}", code="refused"), True
+        content = output.read_bytes()
+        if result.code == COMPLETED:
+            return content, measured(read(output)), True
+        row = CampaignRow(f"{result.code}: {result.reason}", code=result.code)
+        return content, row, is_harmless(result)
+
+
+def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
+    """Return the plan of a campaign without real time; raise InputError for a real device."""
+    plan = planned(campaign, folder, completed_runs(folder) if folder.is_dir() else {})
+    for each in plan.steps:
+        info = each.loaded.device.info
+        if not info.simulated:
+            rule = "only simulated devices run without real time"
+            raise InputError(f"--fast: {each.step.text}: {info.name}: {rule}")
+    return plan
+
+
+def run_fast(plan: CampaignPlan, host: StudyHost, scheduler: str = "none") -> CampaignResult:
+    """Run the remaining steps as fast as possible; raise InputError if the disk has no space."""
+    left = plan.left
+    with workers(scheduler) as run:
+        state = Campaign(plan, host)
+        runs = run(run_task, [_task(each) for each in left])
+        for number, (each, (content, row, harmless)) in enumerate(zip(left, runs, strict=True), 1):
+            state.add(each, _recorded(plan, each, content, row) if content else row)
+            host.on_progress(number / len(left), f"{len(left) - number} of {len(left)} runs left")
+            if not harmless:
+                return state.result(f"{each.step.text}: {row.result}")
+    return state.result()
+
+
+def _task(each: PlannedStep) -> FastTask:
+    loaded = each.loaded
+    folder = str(loaded.folder.absolute())  # a link stays, as in the names of the texts
+    return FastTask(loaded.yaml_text, dict(loaded.files.texts), folder, each.heat_a2)
+
+
+def _recorded(
+    plan: CampaignPlan, each: PlannedStep, content: bytes, row: CampaignRow
+) -> CampaignRow:
+    path = new_recording(plan.folder, plan.campaign.config.name, each.step.number)
+    write_file(path, lambda stream: stream.write(content), overwrite=False)
+    return replace(row, recording=path.name)

@@ -1,13 +1,22 @@
-"""Campaign folder: its lock, its recordings, and repair of truncated ones."""
+"""Campaign folder: its lock, its recordings, repair of truncated ones, and its table."""
 
+import csv
+import io
+import json
 import os
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager, suppress
+from dataclasses import dataclass, field
+from functools import partial
+from importlib.util import find_spec
 from pathlib import Path
+from typing import Any
 
 from mcap.writer import MCAP0_MAGIC
 
+from hilctl.analysis.export import write_parquet
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.files import write_file, write_text
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
 from hilctl.experiment.file import RecordingConfig
 from hilctl.experiment.load import document_with
@@ -16,7 +25,19 @@ from hilctl.recording.recover import recover_recording
 from hilctl.recording.run_summary import read_ends, recordings_in
 from hilctl.run.run_folder import runs
 from hilctl.run.start import RunKey, completed_key
-from hilctl.studies.campaign.steps import CampaignSteps, settings_of
+from hilctl.studies.campaign.plan import CampaignPlan
+from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, cell, settings_of
+from hilctl.studies.multi_run.collect import (
+    PLANNED,
+    RECORDING,
+    REFERENCE,
+    REPEAT,
+    RESULT,
+    STEP,
+    SeriesRun,
+)
+from hilctl.studies.multi_run.digest import FIGURES, RunDigest, RunFigures
+from hilctl.studies.multi_run.varied_parameter import short_value
 
 _LONGEST_WAIT_S = 60.0
 _POLL_S = 0.1
@@ -148,3 +169,85 @@ def new_recording(folder: Path, name: str, number: int) -> Path:
         attempt += 1
         path = folder / f"{name}-{number:04d}-{attempt}.mcap"
     return path
+
+
+@dataclass(frozen=True, slots=True)
+class CampaignRow:
+    """Outcome of a step."""
+
+    result: str = PLANNED  # ``planned``, ``completed``, or code and reason
+    figures: RunFigures = RunFigures()  # noqa: RUF009  frozen
+    recording: str = ""  # name of its recording in the campaign's folder, or empty
+    code: str = PLANNED  # ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``
+    kept: bool = False  # whether it was done already
+    digest: RunDigest | None = field(default=None, compare=False, repr=False)
+
+
+def columns_of(
+    keys: Sequence[str], rows: Sequence[tuple[CampaignStep, CampaignRow]]
+) -> dict[str, list[Any]]:
+    """Return the columns of the table, each with one value per step, or None."""
+    columns: dict[str, list[Any]] = {
+        STEP: [step.number for step, _ in rows],
+        REPEAT: [step.repeat for step, _ in rows],
+        REFERENCE: [step.is_reference for step, _ in rows],
+    }
+    for key in keys:
+        columns[key] = _one_type([cell(step.point.get(key)) for step, _ in rows])
+    for name in FIGURES:
+        columns[name] = [getattr(row.figures, name) for _, row in rows]
+    columns[RESULT] = [row.result for _, row in rows]
+    columns[RECORDING] = [row.recording for _, row in rows]
+    return columns
+
+
+def _one_type(values: list[Any]) -> list[Any]:
+    """Return a column of numbers only, or of texts only, as other programs expect."""
+    given = [value for value in values if value is not None]
+    if all(isinstance(value, bool) for value in given):
+        return values
+    if all(isinstance(value, int | float) and not isinstance(value, bool) for value in given):
+        return [None if value is None else float(value) for value in values]
+    return [
+        value if value is None or isinstance(value, str) else json.dumps(value) for value in values
+    ]
+
+
+def ordered(
+    plan: CampaignPlan, rows: Mapping[int, CampaignRow]
+) -> list[tuple[CampaignStep, CampaignRow]]:
+    """Return all steps in order, each with its row."""
+    return [(each.step, rows.get(each.step.number, CampaignRow())) for each in plan.steps]
+
+
+def write_table(plan: CampaignPlan, rows: Mapping[int, CampaignRow]) -> list[Path]:
+    """Write the table atomically as CSV and, if pyarrow is installed, as Parquet."""
+    table = columns_of(plan.campaign.keys, ordered(plan, rows))
+    config, experiment = plan.campaign.config, str(plan.campaign.experiment)
+    facts = {"campaign": config.name, "description": config.description, "experiment": experiment}
+    path = plan.folder / f"{config.name}.csv"
+    write_text(path, csv_text(table), overwrite=True)
+    written = [path]
+    if find_spec("pyarrow") is not None:
+        written.append(path.with_suffix(".parquet"))
+        write = partial(write_parquet, table=table, facts=facts)
+        write_file(written[-1], write, overwrite=True)
+    return written
+
+
+def csv_text(table: Mapping[str, Sequence[Any]]) -> str:
+    """Return columns as CSV; numbers read back bit for bit, None is empty."""
+    stream = io.StringIO()
+    writer = csv.writer(stream, lineterminator="\n")
+    writer.writerow(table)
+    writer.writerows(zip(*table.values(), strict=True))
+    return stream.getvalue()
+
+
+def entry_of(step: CampaignStep, row: CampaignRow) -> SeriesRun:
+    """Return a step and its outcome as a run of a report."""
+    values = {key: short_value(value) for key, value in step.point.items()}
+    return SeriesRun(
+        step.number, step.is_reference, values, row.figures, row.result, row.recording,
+        row.digest, step.repeat,
+    )  # fmt: skip

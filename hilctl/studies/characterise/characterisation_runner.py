@@ -21,7 +21,7 @@ from hilctl.recording.recording import Recording
 from hilctl.run.result import RunResult
 from hilctl.run.start import RunKey, checked_experiment, unpaced
 from hilctl.studies.characterise.limits import CharacterisationLimits, limits_of
-from hilctl.studies.characterise.response import RigProblemError
+from hilctl.studies.characterise.measurements import RigProblemError
 from hilctl.studies.characterise.results import (
     Characterisation,
     Measured,

@@ -29,8 +29,12 @@ from hilctl.models.base import STROKES, HysteresisModel
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
-from hilctl.studies.characterise.loops import LoopFigures, Repeatability, ReversalCurves
-from hilctl.studies.characterise.response import StepResponseCheck
+from hilctl.studies.characterise.measurements import (
+    LoopFigures,
+    Repeatability,
+    ReversalCurves,
+    StepResponseCheck,
+)
 
 
 @dataclass(frozen=True, slots=True)

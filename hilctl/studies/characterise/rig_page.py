@@ -26,7 +26,7 @@ from hilctl.identify.model_page import drawn_records, errors_by_stroke
 from hilctl.identify.summary import loop_table, summary
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import StagedModel
-from hilctl.studies.characterise.loops import LoopFigures, ReversalCurves
+from hilctl.studies.characterise.measurements import LoopFigures, ReversalCurves
 from hilctl.studies.characterise.results import Characterisation, Measured, ValidationReference
 from hilctl.studies.characterise.waveforms import CREEP_S
 

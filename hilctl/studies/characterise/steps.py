@@ -11,18 +11,16 @@ import numpy as np
 from hilctl.recording.recording import Recording
 from hilctl.studies.characterise import waveforms
 from hilctl.studies.characterise.limits import CharacterisationLimits as Limits
-from hilctl.studies.characterise.loops import (
+from hilctl.studies.characterise.measurements import (
+    RigProblemError,
     all_loops,
     centre_line,
+    crept_percent,
     loop_figures,
     next_amplitude,
+    noise_at_rest,
     repeatability,
     reversal_curves,
-)
-from hilctl.studies.characterise.response import (
-    RigProblemError,
-    crept_percent,
-    noise_at_rest,
     sine_reaction,
     small_signal,
 )

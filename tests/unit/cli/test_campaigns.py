@@ -13,7 +13,7 @@ from hilctl.ilc.ilc_session import IlcResult, IlcRow
 from hilctl.studies.campaign.campaign_runner import CampaignResult
 from hilctl.studies.campaign.plan import planned
 from hilctl.studies.campaign.steps import CampaignStep, load_campaign
-from hilctl.studies.campaign.table import CampaignRow
+from hilctl.studies.campaign.store import CampaignRow
 from hilctl.studies.multi_run.digest import RunFigures
 from hilctl.studies.multi_run.varied_parameter import dimensions
 from tests.unit.studies.campaign.conftest import CAMPAIGN, EXPERIMENT

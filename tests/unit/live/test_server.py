@@ -24,7 +24,6 @@ from hilctl.live.server import (
     LiveServer,
     PageSession,
     PageView,
-    PendingConnections,
     file_response,
     refusal,
 )
@@ -343,17 +342,6 @@ WRONG = ("token.", f"token.{TOKEN[:-1]}", f"token.{TOKEN}0", f"token.{'0' * 32},
 )
 def test_missing_or_wrong_token_is_refused(offer):
     assert refused(Host=HOST, Origin=ORIGIN, Sec_WebSocket_Protocol=offer) == 401
-
-
-def test_oldest_pending_connection_is_aborted():
-    pending, cut = PendingConnections(2), []
-    for name in "abc":
-        pending.add(name, lambda name=name: cut.append(name))
-    assert cut == ["a"]
-    pending.remove("b")
-    pending.remove("x")
-    pending.add("d", lambda: cut.append("d"))
-    assert (cut, len(pending)) == (["a"], 2)
 
 
 class Connection:

@@ -18,7 +18,7 @@ from hilctl.identify.settings import FitSettings
 from hilctl.models.linear_stages import FirstMode, FurtherMode
 from hilctl.models.plays import PpiModel
 from hilctl.studies.characterise import results
-from hilctl.studies.characterise.loops import LoopFigures, ReversalCurves
+from hilctl.studies.characterise.measurements import LoopFigures, ReversalCurves
 from hilctl.studies.characterise.results import (
     FITTED,
     VALIDATED,

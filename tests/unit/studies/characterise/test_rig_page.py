@@ -12,7 +12,7 @@ from hilctl.identify.model_quality import Verdict
 from hilctl.models.linear_stages import FurtherMode
 from hilctl.models.staged import StagedModel
 from hilctl.studies.characterise import rig_page
-from hilctl.studies.characterise.loops import ReversalCurves
+from hilctl.studies.characterise.measurements import ReversalCurves
 from hilctl.studies.characterise.results import Measured, StepRow
 from tests.published import piezo_ppi
 from tests.unit.analysis.response.test_bode import SMALL

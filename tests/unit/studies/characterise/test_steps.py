@@ -3,11 +3,11 @@
 import numpy as np
 import pytest
 
-from hilctl.studies.characterise.response import RigProblemError
+from hilctl.studies.characterise.measurements import RigProblemError
 from hilctl.studies.characterise.results import Measured
 from hilctl.studies.characterise.steps import STEPS, full_amplitude
 from tests.unit.studies.characterise.conftest import plays
-from tests.unit.studies.characterise.test_response import resonator
+from tests.unit.studies.characterise.test_measurements import resonator
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ import pytest
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.studies.campaign.steps import CampaignStep
-from hilctl.studies.campaign.table import CampaignRow, columns_of, csv_text, entry_of
+from hilctl.studies.campaign.store import CampaignRow, columns_of, csv_text, entry_of
 from hilctl.studies.multi_run import collect as module
 from hilctl.studies.multi_run.collect import collect, find_table, read_entries
 from hilctl.studies.multi_run.digest import RunFigures
