@@ -68,11 +68,15 @@ class ErrorSpectrum(NamedTuple):
 
 def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um: F64
                    ) -> ErrorSpectrum | None:  # fmt: skip
-    """Return the spectrum of an error at sample indices; None with too few finite values."""
-    found = _even(index, error_um)
-    if found is None:
+    """Return the spectrum of an error at sample indices, its last ones; None with too few."""
+    finite = np.isfinite(error_um)
+    if np.count_nonzero(finite) < 2 * MOST_HARMONICS:
         return None
-    index, error_um, even = found
+    index, error_um = index[finite][-_MOST_SAMPLES:], error_um[finite][-_MOST_SAMPLES:]
+    span = int(index[-1] - index[0]) + 1
+    if span - index.size > _WIDEST_GAP * span or np.abs(error_um).max() > _LARGEST_UM:
+        return None
+    even = np.interp(np.arange(index[0], index[-1] + 1), index, error_um)
     frequency_hz, amplitude_um = amplitude_spectrum(even, recording.sample_rate_hz)
     since, harmonics_um = index - segment.start, np.empty(0)
     if 2.0 * MOST_HARMONICS < segment.period <= even.size:
@@ -80,18 +84,6 @@ def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um:
             coefficients(since, segment.period, error_um, MOST_HARMONICS)[1:]
         )
     return ErrorSpectrum(frequency_hz, amplitude_um, harmonics_um)
-
-
-def _even(index: I64, values: F64) -> tuple[I64, F64, F64] | None:
-    """Return the last finite values with their indices, and without gaps; None with too few."""
-    finite = np.isfinite(values)
-    if np.count_nonzero(finite) < 2 * MOST_HARMONICS:
-        return None
-    index, values = index[finite][-_MOST_SAMPLES:], values[finite][-_MOST_SAMPLES:]
-    span = int(index[-1] - index[0]) + 1
-    if span - index.size > _WIDEST_GAP * span or np.abs(values).max() > _LARGEST_UM:
-        return None
-    return index, values, np.interp(np.arange(index[0], index[-1] + 1), index, values)
 
 
 def time_history(recording: Recording) -> FigureSpec | None:
@@ -134,11 +126,16 @@ def auxiliary(recording: Recording) -> FigureSpec | None:
 
 def steady_cycles(recording: Recording, focus: int = 0) -> FigureSpec | None:
     """Return the same over the last two steady cycles of a segment; None without any."""
-    zoom = _zoom(recording, focus)
-    if zoom is None:
+    if focus >= len(recording.segments):
         return None
-    label = short_name(recording.segments[focus].label)
-    return _detail("steady_cycles", f"End of the steady part: {label}.", recording, zoom)
+    segment = recording.segments[focus]
+    samples, cycles = steady_samples(recording, segment)
+    if cycles == 0 or samples.index.size == 0:
+        return None
+    stop = int(samples.index[-1]) + 1
+    zoom = recording.samples.part(stop - round(min(cycles, _ZOOM_CYCLES) * segment.period), stop)
+    caption = f"End of the steady part: {short_name(segment.label)}."
+    return _detail("steady_cycles", caption, recording, zoom)
 
 
 def _detail(
@@ -184,18 +181,6 @@ def step_response(recording: Recording, focus: int = 0) -> FigureSpec | None:
         max(segment.start, start - settled // 4), min(stop, start + 4 * settled)
     )
     return _detail("step_response", caption, recording, shown, start)
-
-
-def _zoom(recording: Recording, focus: int) -> Samples | None:
-    """Return the last few steady cycles of a segment; None without any."""
-    if focus >= len(recording.segments):
-        return None
-    samples, cycles = steady_samples(recording, recording.segments[focus])
-    if cycles == 0 or samples.index.size == 0:
-        return None
-    stop = int(samples.index[-1]) + 1
-    cycles = min(cycles, _ZOOM_CYCLES)
-    return recording.samples.part(stop - round(cycles * recording.segments[focus].period), stop)
 
 
 def _mark_judged(axes: Axes, recording: Recording) -> None:
@@ -323,9 +308,10 @@ def lateness(recording: Recording) -> FigureSpec | None:
         marks = tick_lateness.percentiles_us(quantiles)
         for name in ("p50", "p99", "max"):
             _mark(axes, max(marks[name], 1.0), f"{name} {quantity(marks[name], 'us')}")
-        period_ns = tick_lateness.tick_period_ns(ticks)
-        if period_ns is not None and period_ns * 0.5e-3 < bins[-1]:
-            axes.axvline(period_ns * 0.5e-3, color=MARK, linewidth=1.4, label="half a tick period")
+        periods_ns = np.diff(ticks.deadline_ns)
+        half_us = 0.5e-3 * float(np.median(periods_ns)) if periods_ns.size else np.inf
+        if half_us < bins[-1]:
+            axes.axvline(half_us, color=MARK, linewidth=1.4, label="half a tick period")
         name = "time, µs (below 1 µs counts as 1)"
         axes.set(xscale="log", yscale="log", xlabel=name, ylabel="ticks")
         plain_numbers(axes)

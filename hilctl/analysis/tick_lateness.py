@@ -102,13 +102,6 @@ def percentiles_us(times_ns: Quantiles) -> dict[str, float]:
     return {**dict(zip(_PERCENTILES, values, strict=True)), "max": times_ns.largest * 1e-3}
 
 
-def tick_period_ns(ticks: Ticks) -> float | None:
-    """Return the median time between deadlines; None with fewer than two ticks."""
-    if ticks.deadline_ns.size < 2:
-        return None
-    return float(np.median(np.diff(ticks.deadline_ns)))
-
-
 def misses(recording: Recording, ticks: int) -> str:
     """Return a text on the share of skipped ticks; empty if there are none or it is unknown.
 

@@ -168,33 +168,23 @@ class FitSettings(StrictModel):
 class TableSettings(StrictModel):
     """How text tables are read; not used for recordings."""
 
-    unit: CommandUnit | None = Field(None, description="Unit of the command.")
-    command_column: str | int = Field("current_a", description="Column name, or number from 1.")
-    displacement_column: str | int = Field(
-        "displacement_um", description="The same for the displacement in um."
+    unit: CommandUnit | None = _of((), None, "Unit of the command.")
+    command_column: str | int = _of((), "current_a", "Column name, or number from 1.")
+    displacement_column: str | int = _of(
+        (), "displacement_um", "The same for the displacement in um."
     )
-    time_column: str | int | None = Field(
-        None, description="The same for the time in s; or set rate_hz."
+    time_column: str | int | None = _of((), None, "The same for the time in s; or set rate_hz.")
+    rate_hz: float | None = _of((), None, "Samples per second if there is no time column.", gt=0.0)
+    command_scale: float | None = _of((), None, "Unit of the command per unit of its column.")
+    displacement_scale: float | None = _of(
+        (), None, "um per unit of the displacement's column, as um per V of a sensor."
     )
-    rate_hz: float | None = Field(
-        None, gt=0.0, description="Samples per second if there is no time column."
-    )
-    command_scale: float | None = Field(
-        None, description="Unit of the command per unit of its column."
-    )
-    displacement_scale: float | None = Field(
-        None, description="um per unit of the displacement's column, as um per V of a sensor."
-    )
-    skip_rows: int = Field(0, ge=0, description="Lines at the start of a text table to skip.")
-    first_row: int = Field(1, ge=1, description="First data row used, from 1.")
-    last_row: int | None = Field(None, ge=1, description="Last data row used; all if not set.")
-    ignore: int = Field(
-        0, ge=0, description="Rows at the start that are simulated but not evaluated."
-    )
-    lag_samples: int = Field(
-        0, ge=0, le=10_000, description="Lag of the displacement in samples; or auto."
-    )
-    find_lag: bool = Field(False, description="Select the lag with the least error.")
+    skip_rows: int = _of((), 0, "Lines at the start of a text table to skip.", ge=0)
+    first_row: int = _of((), 1, "First data row used, from 1.", ge=1)
+    last_row: int | None = _of((), None, "Last data row used; all if not set.", ge=1)
+    ignore: int = _of((), 0, "Rows at the start that are simulated but not evaluated.", ge=0)
+    lag_samples: int = _of((), 0, "Lag of the displacement in samples; or auto.", ge=0, le=10_000)
+    find_lag: bool = _of((), False, "Select the lag with the least error.")
 
     @model_validator(mode="before")
     @classmethod

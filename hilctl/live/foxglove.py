@@ -102,9 +102,8 @@ class LiveTopics:
 
         Buckets that were overwritten before the call are omitted.
         """
-        first, buckets = self._feed.scope.whole_buckets(_WINDOW_S, self._next_bucket)
-        count, width = buckets.first.shape[1], self._feed.scope.bucket_samples(_WINDOW_S)
-        self._next_bucket = first + count
+        first, width, buckets = self._feed.scope.whole_buckets(_WINDOW_S, self._next_bucket)
+        self._next_bucket = first + buckets.first.shape[1]
         for topic in wanted:
             values: F64 = getattr(buckets, SCOPE_TOPICS[topic])[list(self._rows.values())]
             at = np.flatnonzero(~np.isnan(values).all(axis=0))

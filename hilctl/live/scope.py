@@ -195,18 +195,14 @@ class Scope:
         t_s = np.arange(1 - count, 1) * (trace.width / self._rate_hz)
         return ScopeWindow(t_s.astype(np.float64), trace.window(trace.newest - count + 1, count))
 
-    def whole_buckets(self, window_s: float, since: int) -> tuple[int, Buckets]:
+    def whole_buckets(self, window_s: float, since: int) -> tuple[int, int, Buckets]:
         """Return the completed buckets of a rolling window from number ``since``.
 
-        The first result is the number of the first of them that is still stored.
+        Before them, the number of the first that is still stored, and the samples per bucket.
         """
         trace = self._rolling[window_s]
         first = max(since, trace.newest - trace.keep + 1, 0)
-        return first, trace.window(first, max(0, trace.newest - first))
-
-    def bucket_samples(self, window_s: float) -> int:
-        """Return the number of samples per bucket of a rolling window."""
-        return int(self._rolling[window_s].width)
+        return first, int(trace.width), trace.window(first, max(0, trace.newest - first))
 
     def triggered(self) -> ScopeWindow | None:
         """Return the two newest complete cycles of the waveform; None before the first two.

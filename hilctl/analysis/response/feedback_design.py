@@ -131,7 +131,7 @@ def design_feedback(recording: Recording, response_file: str | None = None) -> F
 
 
 def _measured(recording: Recording) -> MeasuredResponse:
-    found = measured_lines(recording, "input-displacement").lines
+    found = measured_lines(recording, "input-displacement")
     if found.response[0].real < 0.0:
         raise DataError(
             f"{recording.path}: the displacement falls when the reference rises: the sign of the "

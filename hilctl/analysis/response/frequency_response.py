@@ -181,7 +181,7 @@ def _polynomial(natural_hz: float, damping_ratio: float) -> F64:
 
 
 class Lines(NamedTuple):
-    """Response at the excited frequencies."""
+    """Response at the excited frequencies: fields of :class:`FrequencyResponse`."""
 
     frequency_hz: F64
     response: C128
@@ -190,6 +190,9 @@ class Lines(NamedTuple):
     amplitude: float
     averages: int
     free: FreeLines | None = None
+    method: Method = "sines"
+    excitation: str = ""
+    excited_lines: int = 0
 
 
 def frequency_response(recording: Recording, signals: Signals | None = None) -> FrequencyResponse:
@@ -202,40 +205,20 @@ def frequency_response(recording: Recording, signals: Signals | None = None) -> 
     """
     default = SIGNALS[1] if recording.compensated else SIGNALS[0]
     signals = signals or default
-    measured = measured_lines(recording, signals)
-    lines = measured.lines
-    hz, response, noise = lines.frequency_hz, lines.response, lines.noise
+    lines = measured_lines(recording, signals)
     sent, answered = signals.split("-")
     units = {"command": recording.command_unit, "measured": recording.command_unit}
     return FrequencyResponse(
         path=recording.path,
         signals=signals,
         unit=f"{units.get(answered, 'um')}/{units.get(sent, 'um')}",
-        excitation=measured.excitation,
-        method=measured.method,
-        averages=lines.averages,
-        amplitude=lines.amplitude,
-        excited_lines=measured.excited_lines,
-        frequency_hz=hz,
-        response=response,
-        noise=noise,
-        coherence=lines.coherence,
-        free=lines.free,
-        **fitted_fields(hz, response, noise, recording.sample_rate_hz, held=sent == "command"),
+        **lines._asdict(),
+        **fitted_fields(*lines[:3], recording.sample_rate_hz, held=sent == "command"),
     )
 
 
-class MeasuredLines(NamedTuple):
-    """Lines above the noise, with the excitation in words and its number of frequencies."""
-
-    lines: Lines
-    method: Method
-    excitation: str
-    excited_lines: int
-
-
-def measured_lines(recording: Recording, signals: Signals) -> MeasuredLines:
-    """Return the lines of a response without a fit, see :func:`frequency_response`."""
+def measured_lines(recording: Recording, signals: Signals) -> Lines:
+    """Return the lines above the noise without a fit, see :func:`frequency_response`."""
     columns = _columns(recording, signals)
     segments, method = _excitation(recording)
     if method == "sines":
@@ -249,16 +232,18 @@ def measured_lines(recording: Recording, signals: Signals) -> MeasuredLines:
             f"{recording.path}: only {np.count_nonzero(usable)} of {excited} frequencies are above"
             f" the noise, fewer than {_FEWEST_LINES}: increase the amplitude or the duration"
         )
-    lines = lines._replace(
-        frequency_hz=lines.frequency_hz[usable],
+    hz, excitation = lines.frequency_hz[usable], segments[0].label
+    if method == "sines":
+        excitation = f"{len(segments)} sines {hz[0]:g}-{hz[-1]:g} Hz"
+    return lines._replace(
+        frequency_hz=hz,
         response=lines.response[usable],
         noise=lines.noise[usable],
         coherence=lines.coherence[usable],
+        method=method,
+        excitation=excitation,
+        excited_lines=excited,
     )
-    hz, excitation = lines.frequency_hz, segments[0].label
-    if method == "sines":
-        excitation = f"{len(segments)} sines {hz[0]:g}-{hz[-1]:g} Hz"
-    return MeasuredLines(lines, method, excitation, excited)
 
 
 def _columns(recording: Recording, signals: Signals) -> list[str]:
