@@ -44,7 +44,8 @@ class Verdict:
     def __str__(self) -> str:
         if self.reasons:
             return f"not a model: {'; and '.join(self.reasons)}"
-        percent = f"{errors_text(self.classes)}, of a motion's own peak-to-peak"
+        errors = ", ".join(f"{each.peak_percent:.2g} % at {each.label}" for each in self.classes)
+        percent = f"{errors}, of a motion's own peak-to-peak"
         if not self.held_out:
             return f"fit error {percent} (no validation data, so the error elsewhere is unknown)"
         within = {"good": "good: within", "usable": "usable within"}.get(self.grade, "poor: within")
@@ -53,11 +54,6 @@ class Verdict:
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
         return asdict(self) | {"text": str(self)}
-
-
-def errors_text(classes: Sequence[StrokeError]) -> str:
-    """Return the errors by stroke in words."""
-    return ", ".join(f"{each.peak_percent:.2g} % at {each.label}" for each in classes)
 
 
 def grade_of(classes: Sequence[StrokeError], *, known: bool = True) -> Grade:

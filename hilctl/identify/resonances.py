@@ -60,7 +60,11 @@ def further_modes(
     spectra = _spectra(records, modelled_um, bare_um)
     if spectra is None:
         return None
-    before = _Pairs(_packed(known), _smooth_misfit(spectra, known))
+    x = _packed(known)
+    answer = _response(x, spectra.frequency_hz)
+    columns = np.stack(_smooth(spectra), axis=1) * answer[:, None]
+    bare = replace(spectra, transfer=spectra.transfer - answer + 1.0)
+    before = _Pairs(x, _least_squares(bare, columns)[1])
     better = _followed(spectra, before.x, first_hz) if known else before
     more = _one_more(spectra, better.x, first_hz) if len(known) < MOST else None
     rate_hz, chosen = min(record.sample_rate_hz for record in records), better
@@ -184,13 +188,6 @@ def _smooth(spectra: _Spectra) -> tuple[C128, C128, C128]:
     """Return the columns of gain, slope and bend: complex128[k] each."""
     s = 1j * spectra.frequency_hz / spectra.frequency_hz[-1]
     return np.ones_like(s), s, s**2
-
-
-def _smooth_misfit(spectra: _Spectra, known: Sequence[FurtherMode]) -> float:
-    """Return the misfit of known modes with a gain, a slope and a bend."""
-    answer = _response(_packed(known), spectra.frequency_hz)
-    columns = np.stack(_smooth(spectra), axis=1) * answer[:, None]
-    return _least_squares(replace(spectra, transfer=spectra.transfer - answer + 1.0), columns)[1]
 
 
 def _least_squares(spectra: _Spectra, columns: C128) -> tuple[F64, float]:

@@ -17,7 +17,6 @@ from hilctl.live.scope import ROW, SIGNALS, Traces
 from hilctl.run.metadata import LimitBounds, RunDescription
 from hilctl.signals.cycle_metrics import sensor_noise_um
 from hilctl.signals.segment_metrics import SegmentMetrics
-from hilctl.signals.spectrum import amplitude_spectrum, in_bands
 
 WARNING_USED, ERROR_USED = 0.8, 0.95
 """Used fractions of a limit above which a gauge is a warning or an error."""
@@ -50,7 +49,7 @@ class Headroom:
         self._limits: LimitBounds = description.limits
         self._rate_hz, self._unit = description.sample_rate_hz, description.command_unit
         self._heat_a2 = self._limits.heat_a2
-        self._before: F64 | None = None
+        self._before = np.empty((2, 0))
         self._next_sample = 0
         self._aux = [*enumerate(description.aux, len(SIGNALS))]
         names = (*_HELD, *(each.name for _, each in self._aux))
@@ -64,7 +63,10 @@ class Headroom:
         limits, unit = self._limits, self._unit
         self._next_sample = int(traces.index[-1]) + 1
         self._range("command", command, limits.command, unit)
-        slews_per_s = self._slews_per_s(traces.index, command)
+        # With the last sample before them.
+        moves = np.concatenate((self._before, (traces.index, command)), axis=1)
+        self._before = moves[:, -1:]
+        slews_per_s = np.diff(moves[1]) / np.diff(moves[0]) * self._rate_hz
         self._most("slew", np.abs(slews_per_s), limits.slew_per_s, f"{unit}/s")
         self._range("displacement", traces.values[ROW["displacement"]], limits.stroke_um, "um")
         error_um = np.abs(traces.values[ROW["error"]])
@@ -118,14 +120,6 @@ class Headroom:
             if at > oldest and each.used > gauge.used
         ]
         self._held[gauge.name] = [*kept, (self._next_sample, gauge)]
-
-    def _slews_per_s(self, index: I64, command: F64) -> F64:
-        newest = np.array((index[-1], command[-1]))
-        if self._before is not None:
-            index = np.concatenate((self._before[:1], index))
-            command = np.concatenate((self._before[1:], command))
-        self._before = newest
-        return np.diff(command) / np.diff(index) * self._rate_hz
 
 
 FigureValues: TypeAlias = dict[str, float | None]
@@ -230,9 +224,14 @@ class LiveErrorSpectrum:
         size = 1 << (self._newest.size.bit_length() - 1) if self._newest.size else 0
         if size < 256:
             return np.empty(0), np.empty(0)
-        lines = amplitude_spectrum(self._newest[-size:], self._rate_hz)
-        hz, _, largest_um = in_bands(*lines, _SPECTRUM_POINTS)
-        return hz, largest_um
+        window = np.hanning(size)
+        error_um = self._newest[-size:]
+        lines_um = np.abs(np.fft.rfft((error_um - error_um.mean()) * window))
+        lines_um *= 2.0 / window.sum()
+        # Maximum, so that a single line remains visible.
+        edges = np.unique(np.geomspace(1, lines_um.size, _SPECTRUM_POINTS).astype(np.int64))[:-1]
+        largest_um: F64 = np.maximum.reduceat(lines_um, edges)
+        return edges.astype(np.float64) * np.float64(self._rate_hz / size), largest_um
 
 
 class LatenessCounts:

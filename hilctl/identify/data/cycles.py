@@ -50,8 +50,9 @@ def find_period(label: str, command: F64) -> tuple[float, int, int]:
     periods long. Raise DataError if it does not repeat.
     """
     alike = similarity(command)
-    for top in _tops(alike)[:CANDIDATES]:
-        period = _parabola(alike, int(top))
+    for top in _tops(alike)[:CANDIDATES].tolist():
+        left, middle, right = alike[top - 1 : top + 2].tolist()  # the top of a parabola
+        period = top + 0.5 * (left - right) / (left - 2.0 * middle + right)
         stretch = steady_stretch(command, period)
         if stretch is None:
             continue
@@ -73,11 +74,6 @@ def _tops(alike: F64) -> I64:
     first = max(int(np.argmax(alike <= 0.0)), FEWEST_POINTS)
     tops, _ = find_peaks(alike, height=LIKELY, prominence=PROMINENT)
     return np.asarray(tops[tops >= first], dtype=np.int64)
-
-
-def _parabola(values: F64, top: int) -> float:
-    left, middle, right = values[top - 1 : top + 2]
-    return top + 0.5 * float((left - right) / (left - 2.0 * middle + right))
 
 
 def _refined(command: F64, period: float) -> float:

@@ -344,7 +344,8 @@ class ExponentialProblem:
     def _side_slopes(self, outwards: F64, x: F64, sign: float) -> tuple[F64, F64]:
         """Return the derivatives by one side's three parameters, and the slope that it adds."""
         thresholds, weights = self._side(x, sign)
-        shares = self._shares(x)
+        rates = exponential_weights(1.0, float(x[1]) / self._steps.size, self._steps.size)
+        shares = rates / rates.sum()  # of each deadband in the change of slope: float64[k]
         beyond = np.maximum(outwards[:, None] - thresholds, 0.0)
         passed = beyond > 0.0
         bent = shares * (float(shares @ self._steps) - self._steps) / self._steps.size
@@ -398,11 +399,6 @@ class ExponentialProblem:
         beta = float(x[1]) / size
         total = float(exponential_weights(1.0, beta, size).sum())
         return float(x[0]) / total, beta, float(x[2]) * self._half_stroke / (size + 1)
-
-    def _shares(self, x: F64) -> F64:
-        """Return the share of each deadband in the change of slope of a side: float64[k]."""
-        rates = exponential_weights(1.0, float(x[1]) / self._steps.size, self._steps.size)
-        return np.asarray(rates / rates.sum())
 
 
 SearchProblem: TypeAlias = PlaysProblem | ExponentialProblem
