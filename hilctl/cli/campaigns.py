@@ -6,6 +6,7 @@ import signal
 import sys
 from collections.abc import Hashable, Sequence
 from dataclasses import asdict
+from datetime import timedelta
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -148,17 +149,14 @@ def _run_campaign(
         try:
             result = api.campaign(
                 steps, folder, fast=fast, scheduler=scheduler, dry_run=dry_run,
-                on_progress=on_progress, on_plan=on_plan, on_row=on_row, on_note=_note,
+                on_progress=on_progress, on_plan=on_plan, on_row=on_row,
+                on_note=lambda text: print(f"hilctl: {text}", file=sys.stderr),
             )  # fmt: skip
         except KeyboardInterrupt:  # between two runs, or while the coil cools
             text = f"stopped by Ctrl-C between two steps; {_RESUMES}"
             raise StepStoppedError(text, signal.SIGINT) from None
     if result is not None:
         _finish(result, as_json=as_json)
-
-
-def _note(text: str) -> None:
-    print(f"hilctl: {text}", file=sys.stderr)
 
 
 def _finish(result: CampaignResult, *, as_json: bool) -> None:
@@ -243,9 +241,7 @@ def _shown(value: Any) -> str:
 
 def _duration(seconds: float) -> str:
     whole = round(seconds)
-    if whole < 100:
-        return f"{seconds:.0f} s"
-    return f"{whole // 3600}:{whole // 60 % 60:02d}:{whole % 60:02d}"
+    return f"{seconds:.0f} s" if whole < 100 else str(timedelta(seconds=whole))
 
 
 def print_row(varied: Sequence[VariedParameter], step: CampaignStep, row: CampaignRow) -> None:

@@ -196,19 +196,7 @@ class _Run:
 
 
 class FitData:
-    """Commands, rates and evaluated displacements of all records.
-
-    Attributes:
-        target_um: float64[N], measured displacement of all evaluated samples.
-        places: For each record, its part of the N samples.
-        reach: Half the largest peak-to-peak command; plays with a larger threshold do not move in a
-            steady cycle.
-        speed: Largest |rate| of the command, in command units per second.
-        top_hz: Highest frequency of a loop; for histories, of a sine as fast as they are.
-        half_period_s: Half a sample period of the loop; 0.0 if the sample rate is unknown.
-        stroke_um: Largest peak-to-peak displacement of a record.
-        output_range_um: Lowest and highest evaluated displacement.
-    """
+    """Commands, rates and evaluated displacements of all records."""
 
     def __init__(self, records: Records, unit: CommandUnit = "A") -> None:
         if not records:
@@ -219,14 +207,17 @@ class FitData:
         pairs = zip(self.records, runs, strict=True)
         targets = [record.displacement_um[run.judged] for record, run in pairs]
         self._keep(runs, np.concatenate(targets))
+        # Half the largest peak-to-peak command: wider plays do not move in a steady cycle.
         self.reach = max(0.5 * float(np.ptp(run.command)) for run in runs)
-        self.speed = max(float(run.speed.max()) for run in runs)
+        self.speed = max(float(run.speed.max()) for run in runs)  # in command units per second
+        # Highest frequency of a loop; for histories, of a sine as fast as they are.
         turning = self.speed / (2.0 * math.pi * self.reach)
         self.top_hz = max((loop.frequency_hz for loop in self.loops), default=turning)
         rates = {record.sample_rate_hz for record in self.records}
         self.one_rate = len(rates) == 1
+        # Half a sample period of the loop; 0.0 if the sample rate is unknown.
         self.half_period_s = 0.5 / max(rates) if min(rates) > 0.0 else 0.0
-        self.stroke_um = max(float(np.ptp(target)) for target in targets)
+        self.stroke_um = max(float(np.ptp(target)) for target in targets)  # of a record
         self.input_range = (
             min(float(run.command.min()) for run in runs),
             max(float(run.command.max()) for run in runs),
@@ -235,10 +226,10 @@ class FitData:
 
     def _keep(self, runs: Sequence[_Run], target_um: F64) -> None:
         ends = np.cumsum([0, *(_size(run.judged) for run in runs)]).tolist()
-        self.places = tuple(map(slice, ends[:-1], ends[1:]))
+        self.places = tuple(map(slice, ends[:-1], ends[1:]))  # each record's part of the N samples
         placed = zip(runs, self.places, strict=True)
         self._runs = [replace(run, place=place) for run, place in placed]
-        self.target_um = target_um
+        self.target_um = target_um  # float64[N], measured, of all evaluated samples
 
     def thinned(self, scale: F64, points: int) -> tuple["FitData", F64]:
         """Return the data with about ``points`` per loop and whole histories, and their scale."""

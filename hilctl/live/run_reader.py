@@ -283,21 +283,13 @@ def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
 
 @dataclass(frozen=True, slots=True)
 class RunFrame:
-    """State of a run at one time.
+    """State of a run at one time."""
 
-    Attributes:
-        status: Metrics, limits, lateness; see :meth:`RunReader.status`.
-        events: Events since the previous frame.
-        t_s: float64[n], start of each bucket of samples; 0 for the newest.
-        low: Minimum of each bucket by signal, float64[n]; NaN if there is no value.
-        high: Maximum of each bucket by signal.
-    """
-
-    status: dict[str, Any]
-    events: list[Event]
-    t_s: F64
-    low: dict[str, F64]
-    high: dict[str, F64]
+    status: dict[str, Any]  # metrics, limits, lateness; see :meth:`RunReader.status`
+    events: list[Event]  # events since the previous frame
+    t_s: F64  # float64[n], start of each bucket of samples; 0 for the newest
+    low: dict[str, F64]  # minimum of each bucket by signal, float64[n]; NaN if there is no value
+    high: dict[str, F64]  # maximum of each bucket by signal
 
 
 def frames_of(

@@ -9,6 +9,7 @@ import shutil
 import time
 from collections.abc import Callable
 from dataclasses import dataclass, field
+from datetime import timedelta
 from pathlib import Path
 from typing import Any
 
@@ -22,19 +23,15 @@ _WAIT_SHOWN_S = 1.0
 
 @dataclass(frozen=True, slots=True)
 class StudyHost:
-    """Runs, time and observers of a study.
-
-    Attributes:
-        on_progress: Called with the part that is done, 0 to 1, and a description.
-        on_step: Called with the result of each step.
-        on_note: Called with a note on each repaired recording.
-    """
+    """Runs, time and observers of a study."""
 
     run: Callable[..., RunResult] = paced
     now_s: Callable[[], float] = time.time
     sleep_s: Callable[[float], None] = time.sleep
+    # With the part that is done, 0 to 1, and a description.
     on_progress: Callable[[float, str], None] = field(default=lambda done, text: None)
-    on_step: Callable[..., None] = field(default=lambda *result: None)
+    on_step: Callable[..., None] = field(default=lambda *result: None)  # with each step's result
+    # With a note on each repaired recording.
     on_note: Callable[[str], None] = field(default=lambda text: None)
 
 
@@ -74,9 +71,8 @@ class StepRunner:
     def show(self, text: str, seconds: float = 0.0) -> None:
         """Report progress: a description and the time left."""
         done_s = self.done_s + seconds
-        left_s = round(self._total_s - done_s)
-        left = f"{left_s // 3600}:{left_s // 60 % 60:02d}:{left_s % 60:02d} left"
-        self._host.on_progress(done_s / self._total_s, f"{text}; {left}")
+        left = timedelta(seconds=max(0, round(self._total_s - done_s)))
+        self._host.on_progress(done_s / self._total_s, f"{text}; {left} left")
 
 
 def setting(key: str, value: Any) -> str:

@@ -8,6 +8,7 @@ import pytest
 from hilctl.analysis import decimation as module
 from hilctl.analysis import plots
 from hilctl.analysis.decimation import overview
+from hilctl.analysis.figure_layout import drawn
 from hilctl.analysis.plots import hysteresis_loop
 from hilctl.analysis.report import summarize
 from hilctl.analysis.run_page import page
@@ -98,9 +99,9 @@ def test_its_plots_can_be_drawn(small, recording):
     found = overview(Parts(recording))[1]
     assert hysteresis_loop(found) is not None
     assert all(draw(found) is not None for draw in (plots.time_history, plots.error))
-    last = plots._zoom(found, 0)
-    assert last is not None
-    assert last.index.tolist() == list(range(29_500 - 1000, 29_500))
+    (shown, *_), _ = (axes.lines for axes in drawn(plots.steady_cycles(found)).axes)
+    index = np.round(shown.get_xdata() * found.sample_rate_hz)
+    assert index.tolist() == list(range(29_500 - 1000, 29_500))
 
 
 def test_its_page_has_the_figures_of_the_whole(small, recording, undrawn):
