@@ -68,7 +68,7 @@ class ErrorSpectrum(NamedTuple):
 
 def error_spectrum(recording: Recording, segment: Segment, index: I64, error_um: F64
                    ) -> ErrorSpectrum | None:  # fmt: skip
-    """Return the spectrum of an error at sample indices, its last ones; None with too few."""
+    """Return the spectrum of the last finite errors at sample indices; None with too few."""
     finite = np.isfinite(error_um)
     if np.count_nonzero(finite) < 2 * MOST_HARMONICS:
         return None

@@ -145,11 +145,6 @@ class Linear:
     c_s: float = 0.0
     q_s2: float = 0.0
 
-    @property
-    def none(self) -> bool:
-        """Whether there is neither structure nor delay."""
-        return self.delay_s == 0.0 and self.c_s == 0.0 and self.q_s2 == 0.0
-
     def response(self, s: Spectrum) -> Spectrum:
         """Return the transfer function at each s = j w."""
         return np.asarray(np.exp(-s * self.delay_s) / (1.0 + s * (self.c_s + s * self.q_s2)))
@@ -214,7 +209,6 @@ class FitData:
         turning = self.speed / (2.0 * math.pi * self.reach)
         self.top_hz = max((loop.frequency_hz for loop in self.loops), default=turning)
         rates = {record.sample_rate_hz for record in self.records}
-        self.one_rate = len(rates) == 1
         # Half a sample period of the loop; 0.0 if the sample rate is unknown.
         self.half_period_s = 0.5 / max(rates) if min(rates) > 0.0 else 0.0
         self.stroke_um = max(float(np.ptp(target)) for target in targets)  # of a record
@@ -278,11 +272,6 @@ class FitData:
         more = BEYOND * 0.5 * (high - low)
         return low - more, high + more
 
-    @property
-    def all_steady(self) -> bool:
-        """Whether every record is a steady loop, as dynamic stages need."""
-        return all(run.s is not None for run in self._runs)
-
     def play_sum(self, direct: float, thresholds: F64, weights: F64, growth_s: float) -> F64:
         """Return ``direct v + sum weights_i F_i[v]`` of all evaluated samples: float64[N]."""
         out = np.empty(self.target_um.size)
@@ -343,7 +332,7 @@ class FitData:
 
     def through(self, signals: F64, linear: Linear) -> F64:
         """Return the response of the linear stages to signals float64[N, k]."""
-        if linear.none:
+        if linear == Linear():
             return signals
         out = np.empty_like(signals)
         for run in self._runs:

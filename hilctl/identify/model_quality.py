@@ -168,7 +168,7 @@ def _unfollowed(records: Sequence[Record]) -> str:
 
 
 def _alike_loops(records: Sequence[Record]) -> Iterator[str]:
-    """Yield that loops have one frequency or amplitude, except for a tenth of them at each end."""
+    """Yield notes on loops of one frequency or amplitude (80 % of them)."""
     frequencies_hz, sizes = map(np.concatenate, zip(*map(_swings, records), strict=True))
     low, high = np.percentile((frequencies_hz, sizes), (10.0, 90.0), axis=1, method="nearest")
     if high[0] < ALIKE * low[0]:

@@ -167,8 +167,10 @@ class ResidualFit:
         rate_hz = 1.0 / self._window_s  # one sample per window, so that rates are those of runs
         for x in self._motions():
             rows = np.unique(np.linspace(0, x.size - 1, ROWS).astype(np.int64))
-            columns, was = self._columns(x, rows, rate_hz), self._was(x, rate_hz)[rows]
-            total += _sums(columns, was, self._weight(x, rows))
+            was = np.zeros(rows.size)  # output of the old residual operator
+            if isinstance(self._old, RefinedModel):
+                was = (self._through(self._old, x, rate_hz) - self._rest_um - x)[rows]
+            total += _sums(self._columns(x, rows, rate_hz), was, self._weight(x, rows))
         return total.scaled(ANCHOR * len(self._runs))
 
     def _motions(self) -> Iterator[F64]:
@@ -226,12 +228,6 @@ class ResidualFit:
     def _through(self, model: RefinedModel, x: F64, rate_hz: float) -> F64:
         operator = model.residual.forward(rate_hz, self._rest_um)
         return operator.process(x + self._rest_um) + model.output_offset_um
-
-    def _was(self, x: F64, rate_hz: float) -> F64:
-        """Return the output of the old residual operator: float64[n]."""
-        if not isinstance(self._old, RefinedModel):
-            return np.zeros(x.size)
-        return self._through(self._old, x, rate_hz) - self._rest_um - x
 
     def _of(self, x: F64, run: History, *, own: bool) -> NormalEquations:
         rows = _rows(run)

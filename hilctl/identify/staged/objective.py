@@ -114,13 +114,6 @@ class Point:
             offset_um=float(x[-1]),
         )
 
-    @property
-    def corners_um(self) -> F64:
-        """Thresholds of the deadbands, from the lowest up: float64[2 k]."""
-        d_p, d_n = self.spacings_um
-        k = self.up.size
-        return np.concatenate((-d_n * np.arange(k, 0, -1), d_p * np.arange(1, k + 1)))
-
 
 def bounds(data: FitData, layers: Layers, point: Point) -> tuple[F64, F64]:
     """Return lowest and highest values, float64[p]; equal for fixed parameters."""
@@ -158,7 +151,8 @@ def error_and_slopes(data: FitData, layers: Layers, point: Point) -> tuple[F64, 
     lagged = data.lagged(float(point.before[0]), float(point.before[1]))
     w, outputs, by = data.plays(point.before, layers.numbers, point.weights, lagged)
     inner = point.direct * w + outputs @ point.weights
-    k, corners = point.up.size, point.corners_um
+    k, (d_p, d_n) = point.up.size, point.spacings_um
+    corners = np.concatenate((-d_n * np.arange(k, 0, -1), d_p * np.arange(1, k + 1)))
     parts = segments(inner, corners)
     rates = np.concatenate((point.down[::-1], [1.0], point.up))
     gain = rates[np.searchsorted(corners, inner)][:, None]

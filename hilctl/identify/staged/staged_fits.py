@@ -200,13 +200,13 @@ def find_staged(job: FitJob, data: FitData, layers: Layers) -> StagedEnd:
 
 
 def _check(data: FitData, layers: Layers) -> None:
-    if layers.dynamic and not data.all_steady:
+    if layers.dynamic and len(data.loops) < len(data.records):
         raise DataError(
             "lag, structure and delay need steady loops, but there is a history: omit --whole if "
             "they repeat, otherwise use a model without stages (--model integrated, or "
             "--set lag=none --set structure=false --set delay=false)"
         )
-    if layers.dynamic and not data.one_rate:
+    if layers.dynamic and len({record.sample_rate_hz for record in data.records}) > 1:
         raise DataError(
             "lag, structure and delay need runs at one sample rate, since the delay of a loop "
             "depends on it"

@@ -1,4 +1,4 @@
-"""Evaluation of recordings: noise, reaction, response, loops, reversal curves; problems."""
+"""Evaluation of the recording of a step: noise, reaction, response, loops, reversal curves."""
 
 import math
 from collections.abc import Sequence

@@ -52,11 +52,6 @@ class Measured:
     crept_percent: tuple[float, ...] = ()  # creep in each hold, of the motion to it
     repeated: Repeatability | None = None  # change of the largest growing loop at the end
 
-    def to_mapping(self) -> dict[str, Any]:
-        """Return plain values without signals."""
-        made: dict[str, Any] = to_jsonable_python(asdict(self, dict_factory=_without_signals))
-        return made
-
 
 @dataclass(frozen=True, slots=True)
 class ValidationReference:
@@ -149,7 +144,7 @@ class Characterisation:
             "band_hz": list(self.band_hz),
             "rig_time_s": sum(step.seconds for step in self.steps),
             "steps": [asdict(step) for step in self.steps],
-            "measured": self.measured.to_mapping(),
+            "measured": to_jsonable_python(asdict(self.measured, dict_factory=_without_signals)),
             "model": None if found is None else found.to_mapping(),
         }
 
