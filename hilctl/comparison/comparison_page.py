@@ -35,14 +35,10 @@ def comparison_sheets(comparison: Comparison) -> Iterator[FigureSpec]:
     modelled = [(row.name, hz, [error.peak_percent for error in row.error.errors]) for row in rows]
     panels = [Panel(partial(_draw_errors, lines=modelled), "model", 0.7)]
     if comparison.device:
-        tried = [
-            (
-                row.name,
-                [t.frequency_hz for t in row.trials],
-                [t.peak_error_percent for t in row.trials],
-            )
-            for row in rows
-        ]
+        tried = []
+        for row in rows:
+            percents = [trial.peak_error_percent for trial in row.trials]
+            tried.append((row.name, [trial.frequency_hz for trial in row.trials], percents))
         panels.append(Panel(partial(_draw_errors, lines=tried), "compensated", 0.7))
     yield FigureSpec("errors", "Largest error against frequency.", tuple(panels))
     number = _fastest(loops)

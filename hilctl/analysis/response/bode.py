@@ -1,6 +1,7 @@
 """Bode plot, table and page of frequency responses."""
 
 from collections.abc import Iterator, Sequence
+from dataclasses import asdict
 from functools import partial
 from pathlib import Path
 from typing import Any
@@ -99,8 +100,7 @@ def fit_rows(found: FrequencyResponse) -> Iterator[tuple[str, str]]:
     """Yield results with their standard errors, each as name and text."""
     yield "signals", signals_text(found)
     yield "excitation", f"{found.excitation}, {found.averages} {_COUNTED[found.method]}"
-    used = f"{found.frequency_hz.size} of {found.excited_lines} above the noise"
-    yield "frequencies", used
+    yield "frequencies", f"{found.frequency_hz.size} of {found.excited_lines} above the noise"
 
     def measured(name: str, unit: str = "") -> str:
         error = quantity(found.errors.get(name), unit, 2)
@@ -120,20 +120,13 @@ def fit_rows(found: FrequencyResponse) -> Iterator[tuple[str, str]]:
     if found.bandwidth_hz is not None:
         bandwidth = quantity(found.bandwidth_hz, "Hz", 4)
     yield "-3 dB bandwidth", bandwidth
-    lowest = significant(float(found.coherence.min()), 4)
-    yield (
-        "coherence",
-        f"median {significant(float(np.median(found.coherence)), 4)}, lowest {lowest}",
-    )
+    middle, lowest = (significant(float(f(found.coherence)), 4) for f in (np.median, np.min))
+    yield "coherence", f"median {middle}, lowest {lowest}"
     yield "residual of the fit", f"{quantity(found.misfit_percent, '%')} rms of the gain"
     if (free := found.free) is not None:
-        parts = (
-            ("even", free.even_percent),
-            ("odd", free.odd_percent),
-            ("noise", free.noise_percent),
-        )
-        text = ", ".join(f"{name} {quantity(value, '%', 2)}" for name, value in parts)
-        yield "lines not excited", text
+        parts = asdict(free).items()
+        texts = (f"{name.partition('_')[0]} {quantity(value, '%', 2)}" for name, value in parts)
+        yield "lines not excited", ", ".join(texts)
 
 
 _COUNTED = {"periods": "periods", "averaged spectra": "averages", "sines": "cycles or more"}

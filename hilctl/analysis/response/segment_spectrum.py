@@ -197,10 +197,8 @@ def spectrum_rows(found: SegmentSpectrum) -> Iterator[tuple[str, str]]:
         yield "largest deviation", quantity(rest.peak_um, "um")
         yield "mean", quantity(rest.mean_um, "um", 4)
         yield "drift", quantity(_NM * rest.drift_um_per_s, "nm/s")
-        yield (
-            "strongest line",
-            f"{quantity(rest.line_um, 'um')} at {quantity(rest.line_hz, 'Hz', 4)}",
-        )
+        line_hz = quantity(rest.line_hz, "Hz", 4)
+        yield "strongest line", f"{quantity(rest.line_um, 'um')} at {line_hz}"
         most = "at most " if rest.bias_time_s == rest.averaging_s[-1] else ""
         at = quantity(rest.bias_time_s, "s")
         yield "bias instability", f"{most}{quantity(rest.bias_instability_um, 'um')} at {at}"
