@@ -121,18 +121,21 @@ class Coil:
     step_s: float
 
 
-class Rods(ABC):
+class Rods:
     """Rods in a coil: current in, displacement without structure or load out.
 
-    The kernel does :meth:`follow`; after the arguments of that it gets its state and constants.
+    Attributes:
+        rest: Goes to the state in which only the bias has ever been there, and returns its
+            displacement, um; to be called first.
+        state: Array that the kernel updates.
     """
 
-    def __init__(self, kernel: Callable[..., object], *arguments: object) -> None:
-        self._kernel, self._arguments = kernel, arguments
-
-    @abstractmethod
-    def rest(self) -> float:
-        """Go to the state in which only the bias has ever been there; return its displacement."""
+    def __init__(
+        self, rest: Callable[[], float], kernel: Callable[..., object], state: F64, *more: object
+    ) -> None:
+        """Take the kernel that does :meth:`follow`, and its arguments after those of that."""
+        self.rest, self.state = rest, state
+        self._kernel, self._arguments = kernel, (state, *more)
 
     def follow(self, halves_a: F64, free_um: F64) -> None:
         """Advance step by step.
@@ -152,7 +155,7 @@ class RodParameters(ABC):
 
     @abstractmethod
     def rods(self, coil: Coil) -> Rods:
-        """Return such rods in a coil; :meth:`Rods.rest` comes before anything else."""
+        """Return such rods in a coil."""
 
     @abstractmethod
     def varied(self, lag: float, pinning: float, strain: float) -> "RodParameters":

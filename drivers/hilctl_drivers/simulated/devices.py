@@ -28,7 +28,7 @@ from hilctl_drivers.simulated.actuator_base import Plant, RodParameters
 from hilctl_drivers.simulated.diffusion import DiffusionParameters
 from hilctl_drivers.simulated.domains import DomainsParameters
 from hilctl_drivers.simulated.jiles_atherton import GrowingLagParameters, JilesAthertonParameters
-from hilctl_drivers.simulated.piezo import PiezoParameters
+from hilctl_drivers.simulated.piezo import PiezoActuator, PiezoParameters
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.terfenol import (
     CreepEffect,
@@ -37,7 +37,7 @@ from hilctl_drivers.simulated.terfenol import (
     TerfenolParameters,
     Thermal,
 )
-from hilctl_drivers.simulated.thermal_switching import SwitchingParameters
+from hilctl_drivers.simulated.thermal_switching import SwitchingActuator, SwitchingParameters
 
 FIFO_DEPTH = 4096
 MAX_RATE_HZ = 200e3
@@ -533,4 +533,7 @@ class SimulatedPiezo(SimulatedDevice):
 
     def plant(self, sample_rate_hz: float) -> Plant:
         """Return the stage at rest."""
-        return self._parameters.plant(sample_rate_hz, self._seed)
+        parameters = self._parameters
+        if isinstance(parameters, PiezoParameters):
+            return PiezoActuator(parameters, sample_rate_hz, self._seed)
+        return SwitchingActuator(parameters, sample_rate_hz, self._seed)

@@ -56,8 +56,25 @@ class DiffusionParameters(RodParameters):
     shells: int = 8  # number of shells, equally thick
 
     def rods(self, coil: Coil) -> Rods:
-        """Return such rods in a coil."""
-        return Diffusion(self, coil)
+        """Return shells of pinned cells in a coil."""
+        bias = coil.bias_a_per_m
+        curve = saturation, knee = self.saturation_a_per_m, self.knee_a_per_m
+        strain_um = 1.5e6 * self.saturation_strain * ROD_LENGTH_M
+        state = np.zeros((3, self.shells))
+        pinned = np.zeros((self.cells, self.shells))
+
+        def rest() -> float:
+            """Put every cell of every shell at the bias field, with no cell strained."""
+            pinned[:] = bias
+            share = bias / (knee + abs(bias))
+            state[:] = [[bias], [saturation * share], [0.0]]
+            return strain_um * share * share
+
+        cells, conductances, areas = self.cell_table(), self.conductances(coil.step_s), self.areas()
+        field = coil.factor_per_m, bias
+        return Rods(
+            rest, _follow, state, pinned, cells, conductances, areas, field, curve, strain_um
+        )
 
     def varied(self, lag: float, pinning: float, strain: float) -> "DiffusionParameters":
         """Return rods that differ by these factors; the lag is that of the diffusion."""
@@ -210,34 +227,3 @@ def _follow(
             state[1, j] = shells[1, j]
         free_um[k] = strain_um * strain
         magnetise(shells, pinned, cells, curve, False)
-
-
-class Diffusion(Rods):
-    """Shells of pinned cells; at rest the bias field is everywhere and no cell is strained."""
-
-    def __init__(self, parameters: DiffusionParameters, coil: Coil) -> None:
-        self._bias = coil.bias_a_per_m
-        self._curve = (parameters.saturation_a_per_m, parameters.knee_a_per_m)
-        self._strain_um = 1.5e6 * parameters.saturation_strain * ROD_LENGTH_M
-        self._state = np.zeros((3, parameters.shells))
-        self._pinned = np.zeros((parameters.cells, parameters.shells))
-        super().__init__(
-            _follow,
-            self._state,
-            self._pinned,
-            parameters.cell_table(),
-            parameters.conductances(coil.step_s),
-            parameters.areas(),
-            (coil.factor_per_m, coil.bias_a_per_m),
-            self._curve,
-            self._strain_um,
-        )
-
-    def rest(self) -> float:
-        """Put every cell of every shell at the bias field."""
-        saturation, knee = self._curve
-        bias = self._bias
-        self._pinned[:] = bias
-        share = bias / (knee + abs(bias))
-        self._state[:] = [[bias], [saturation * share], [0.0]]
-        return self._strain_um * share * share

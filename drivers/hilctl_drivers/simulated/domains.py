@@ -77,8 +77,35 @@ class DomainsParameters(RodParameters):
     resistivity_ohm_m: float = 0.6e-6  # rho
 
     def rods(self, coil: Coil) -> Rods:
-        """Return such rods in a coil."""
-        return Domains(self, coil)
+        """Return domains of eight orientations in a coil."""
+        bias, saturation = coil.bias_a_per_m, self.saturation_a_per_m
+        eddy = VACUUM_PERMEABILITY * ROD_RADIUS_M**2 / (8.0 * self.resistivity_ohm_m)
+        table, energies = self.table(), self.energies
+        state = np.zeros((3, table.shape[1]))
+
+        def rest() -> float:
+            """Go to the anhysteretic state, with Boltzmann's fractions at the bias field."""
+            work = np.empty((8, table.shape[1]))
+            equilibrium(bias, table, energies, work)
+            fractions = table[0] * work[0]
+            state[:2] = work[0]
+            state[2, :3] = bias, bias + saturation * (fractions @ work[1]), 0.0
+            return float(1e6 * ROD_LENGTH_M * (fractions @ work[2]))
+
+        constants = (coil.factor_per_m, bias, coil.step_s, eddy, saturation)
+        return Rods(rest, _follow, state, table, constants, energies, 1e6 * ROD_LENGTH_M)
+
+    @property
+    def energies(self) -> Energies:
+        """K, mu_0 M_s, sigma, Omega, k_p and c."""
+        return (
+            self.anisotropy_j_per_m3,
+            VACUUM_PERMEABILITY * self.saturation_a_per_m,
+            self.stress_pa,
+            self.spread_j_per_m3,
+            self.pinning_j_per_m3,
+            self.reversibility,
+        )
 
     def varied(self, lag: float, pinning: float, strain: float) -> "DomainsParameters":
         """Return rods that differ by these factors; the lag is that of the eddy currents."""
@@ -139,7 +166,7 @@ def equilibrium(field: float, table: F64_2D, energies: Energies, work: F64_2D) -
     Args:
         field: Field in the rods.
         table: float64[11, n], see ``DomainsParameters.table``.
-        energies: K, mu_0 M_s, sigma, Omega, k_p, c.
+        energies: See ``DomainsParameters.energies``.
         work: float64[8, n], rows 0 to 5 filled: f_an (of one of the kind), m.u, m.Q m, and their
             slopes with the field.
     """
@@ -260,36 +287,3 @@ def _follow(
             fraction = energies[5] * state[0, i] + (1.0 - energies[5]) * state[1, i]
             strain += table[0, i] * fraction * (work[2, i] + correction * work[5, i])
         free_um[k] = length_um * strain
-
-
-class Domains(Rods):
-    """Domains of eight orientations; at rest their fractions are Boltzmann's, at the bias field."""
-
-    def __init__(self, parameters: DomainsParameters, coil: Coil) -> None:
-        saturation = parameters.saturation_a_per_m
-        eddy = VACUUM_PERMEABILITY * ROD_RADIUS_M**2 / (8.0 * parameters.resistivity_ohm_m)
-        self._bias, self._saturation = coil.bias_a_per_m, saturation
-        self._energies = (
-            parameters.anisotropy_j_per_m3,
-            VACUUM_PERMEABILITY * saturation,
-            parameters.stress_pa,
-            parameters.spread_j_per_m3,
-            parameters.pinning_j_per_m3,
-            parameters.reversibility,
-        )
-        self._table = parameters.table()
-        self._state = np.zeros((3, self._table.shape[1]))
-        constants = (coil.factor_per_m, coil.bias_a_per_m, coil.step_s, eddy, saturation)
-        super().__init__(
-            _follow, self._state, self._table, constants, self._energies, 1e6 * ROD_LENGTH_M
-        )
-
-    def rest(self) -> float:
-        """Go to the anhysteretic state at the bias field."""
-        bias, saturation = self._bias, self._saturation
-        work = np.empty((8, self._table.shape[1]))
-        equilibrium(bias, self._table, self._energies, work)
-        fractions = self._table[0] * work[0]
-        self._state[:2] = work[0]
-        self._state[2, :3] = bias, bias + saturation * (fractions @ work[1]), 0.0
-        return float(1e6 * ROD_LENGTH_M * (fractions @ work[2]))

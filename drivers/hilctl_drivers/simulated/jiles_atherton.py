@@ -82,9 +82,35 @@ class JilesAthertonParameters(RodParameters):
         wall = 0.1356 * self.wall_field_a_per_m * VACUUM_PERMEABILITY * section
         return eddy, math.sqrt(wall / self.resistivity_ohm_m), self.lag_growth_m_per_a
 
+    @property
+    def material(self) -> Material:
+        """M_s, a, k, c and alpha'."""
+        return (
+            self.saturation_a_per_m,
+            self.shape_a_per_m,
+            self.pinning_a_per_m,
+            self.reversibility,
+            self.effective_coupling,
+        )
+
     def rods(self, coil: Coil) -> Rods:
         """Return such rods in a coil."""
-        return JilesAtherton(self, coil)
+        material = saturation, shape, _, _, coupling = self.material
+        strain_um = 1.5e6 * self.saturation_strain * ROD_LENGTH_M
+        state, bias = np.zeros(2), coil.bias_a_per_m
+
+        def rest() -> float:
+            """Go to the anhysteretic curve at the bias field, as after demagnetising."""
+            magnetisation = 0.0
+            for _ in range(100):  # Newton: M - M_s L is monotone where alpha' M_s < 3 a
+                value, slope = langevin((bias + coupling * magnetisation) / shape)
+                excess = magnetisation - saturation * value
+                magnetisation -= excess / (1.0 - coupling * saturation * slope / shape)
+            state[:] = bias, magnetisation
+            return strain_um * (magnetisation / saturation) ** 2
+
+        constants = (coil.factor_per_m, bias, coil.step_s)
+        return Rods(rest, _follow, state, constants, material, self.losses, strain_um)
 
     def varied(self, lag: float, pinning: float, strain: float) -> "JilesAthertonParameters":
         """Return rods that differ by these factors; the lag is that of the eddy currents."""
@@ -129,7 +155,7 @@ def susceptibility(field: float, magnetisation: float, sign: float, material: Ma
         field: H in A/m.
         magnetisation: M in A/m.
         sign: delta, 1 in a rising field and -1 in a falling one.
-        material: M_s, a, k, c, alpha'.
+        material: See ``JilesAthertonParameters.material``.
     """
     saturation, shape, pinning, reversible, coupling = material
     value, slope = langevin((field + coupling * magnetisation) / shape)
@@ -192,35 +218,3 @@ def _follow(
         free_um[k] = strain_um * share * share
     state[0] = field
     state[1] = magnetisation
-
-
-class JilesAtherton(Rods):
-    """Jiles-Atherton rods; at rest they are on their anhysteretic curve, as after demagnetising."""
-
-    def __init__(self, parameters: JilesAthertonParameters, coil: Coil) -> None:
-        self._bias = coil.bias_a_per_m
-        self._material = (
-            parameters.saturation_a_per_m,
-            parameters.shape_a_per_m,
-            parameters.pinning_a_per_m,
-            parameters.reversibility,
-            parameters.effective_coupling,
-        )
-        self._strain_um = 1.5e6 * parameters.saturation_strain * ROD_LENGTH_M
-        self._state = np.zeros(2)
-        constants = (coil.factor_per_m, coil.bias_a_per_m, coil.step_s)
-        super().__init__(
-            _follow, self._state, constants, self._material, parameters.losses, self._strain_um
-        )
-
-    def rest(self) -> float:
-        """Go to the anhysteretic magnetisation at the bias field."""
-        saturation, shape, _, _, coupling = self._material
-        field = self._bias
-        magnetisation = 0.0
-        for _ in range(100):  # Newton: M - M_s L is monotone where alpha' M_s < 3 a
-            value, slope = langevin((field + coupling * magnetisation) / shape)
-            excess = magnetisation - saturation * value
-            magnetisation -= excess / (1.0 - coupling * saturation * slope / shape)
-        self._state[:] = field, magnetisation
-        return self._strain_um * (magnetisation / saturation) ** 2

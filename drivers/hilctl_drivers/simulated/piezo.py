@@ -42,10 +42,6 @@ class PiezoParameters:
     sensor_bandwidth_hz: float = 10e3  # corner of the first-order sensor
     sensor_noise_um: float = 1e-3  # noise of each reading, rms
 
-    def plant(self, sample_rate_hz: float, seed: int) -> Plant:
-        """Return the stage at rest."""
-        return PiezoActuator(self, sample_rate_hz, seed)
-
 
 @kernel()
 def _run(

@@ -33,8 +33,20 @@ class PinnedCellsParameters(RodParameters):
     strain_quartic: float = -0.689  # weight of its fourth-order term beside the second-order one
 
     def rods(self, coil: Coil) -> Rods:
-        """Return pinned cells in a coil."""
-        return PinnedCells(self, coil)
+        """Return cells with dry friction behind one lag of the field."""
+        bias, state, cells = coil.bias_a_per_m, np.zeros(1), self.table()
+        lag = self.lag_s, self.lag_growth_m_per_a
+        curve = self.langevin_field_a_per_m, self.strain_um, self.strain_quartic
+
+        def rest() -> float:
+            """Put every cell at the bias field."""
+            state[0] = bias
+            cells[2] = bias
+            return free_displacement(cells, bias, curve)
+
+        ensure_compiled(_follow)
+        constants = (coil.factor_per_m, bias, coil.step_s, *lag)
+        return Rods(rest, _follow, state, cells, constants, curve)
 
     def varied(self, lag: float, pinning: float, strain: float) -> "PinnedCellsParameters":
         """Return cells that differ by these factors."""
@@ -131,27 +143,3 @@ def _follow(
         field = _advance_field(field, drive, step, lag, growth)
         free_um[k] = free_displacement(cells, field, material)
     state[0] = field
-
-
-class PinnedCells(Rods):
-    """Cells with dry friction behind one lag of the field."""
-
-    def __init__(self, parameters: PinnedCellsParameters, coil: Coil) -> None:
-        self._bias = bias = coil.bias_a_per_m
-        lag = parameters.lag_s, parameters.lag_growth_m_per_a
-        self._curve = (
-            parameters.langevin_field_a_per_m,
-            parameters.strain_um,
-            parameters.strain_quartic,
-        )
-        self._cells = parameters.table()
-        self._state = np.zeros(1)
-        constants = (coil.factor_per_m, bias, coil.step_s, *lag)
-        super().__init__(_follow, self._state, self._cells, constants, self._curve)
-        ensure_compiled(_follow)
-
-    def rest(self) -> float:
-        """Put every cell at the bias field."""
-        self._state[0] = self._bias
-        self._cells[2] = self._bias
-        return free_displacement(self._cells, self._bias, self._curve)

@@ -58,10 +58,6 @@ class SwitchingParameters:
     sensor_noise_um: float = 1e-3  # noise of each reading, rms
     step_max_s: float = 5e-6  # longest internal time step
 
-    def plant(self, sample_rate_hz: float, seed: int) -> Plant:
-        """Return the stack at rest."""
-        return SwitchingActuator(self, sample_rate_hz, seed)
-
     def domains(self, step_s: float) -> F64:
         """Return float64[4, m]: switching at 0 V in a step, forth and back, weight, equilibrium."""
         low, high = self.bias_range_v

@@ -212,7 +212,7 @@ def magnetisation(rods, field):
     for k in range(found.size):
         ends = np.array([field[k], 0.5 * (field[k] + field[k + 1]), field[k + 1]]) - field[0]
         model.follow(ends, np.empty(1))
-        state = model._state
+        state = model.state
         found[k] = state[1] if state.ndim == 1 else state[2, 1] - state[2, 0]
     return found
 

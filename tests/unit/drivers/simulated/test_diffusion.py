@@ -8,7 +8,7 @@ from scipy.integrate import solve_ivp
 from scipy.special import jv
 
 from hilctl_drivers.simulated.actuator_base import ROD_RADIUS_M, VACUUM_PERMEABILITY, Coil
-from hilctl_drivers.simulated.diffusion import Diffusion, DiffusionParameters, magnetise
+from hilctl_drivers.simulated.diffusion import DiffusionParameters, magnetise
 
 RATED = DiffusionParameters()
 STEP_S = 1e-5
@@ -26,12 +26,12 @@ LINEAR = replace(
 
 def shells(rods, halves_a_per_m, bias=0.0):
     """H and M of each shell after each step; the field at the surface is given, and the bias."""
-    model = Diffusion(rods, Coil(1.0, bias, STEP_S))
+    model = rods.rods(Coil(1.0, bias, STEP_S))
     model.rest()
     found = np.empty(((halves_a_per_m.size - 1) // 2, 2, rods.shells))
     for k in range(found.shape[0]):
         model.follow(halves_a_per_m[2 * k : 2 * k + 3], np.empty(1))
-        found[k] = model._state[:2]
+        found[k] = model.state[:2]
     return found[:, 0], found[:, 1]
 
 
@@ -89,10 +89,10 @@ def test_flux_is_kept():
 def test_slow_field_is_the_same_everywhere():
     """At 0.5 Hz there is no skin effect."""
     n = 200_000
-    model = Diffusion(RATED, Coil(5.09e3, 44.1e3, STEP_S))
+    model = RATED.rods(Coil(5.09e3, 44.1e3, STEP_S))
     model.rest()
     model.follow(6.0 * np.sin(np.pi * 0.5 * STEP_S * np.arange(2 * n + 1)), np.empty(n))
-    assert np.ptp(model._state[0]) < 100.0
+    assert np.ptp(model.state[0]) < 100.0
 
 
 def test_cells_hold_until_the_field_is_beyond_their_pinning():

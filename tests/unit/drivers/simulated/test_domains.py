@@ -51,9 +51,9 @@ def all_eight(field):
 
 def at_rest(field, rods=RATED):
     """M / M_s and displacement in um of the anhysteretic state."""
-    model = domains.Domains(rods, Coil(1.0, field, STEP_S))
+    model = rods.rods(Coil(1.0, field, STEP_S))
     rest_um = model.rest()
-    return float((model._state[2, 1] - field) / rods.saturation_a_per_m), rest_um
+    return float((model.state[2, 1] - field) / rods.saturation_a_per_m), rest_um
 
 
 @pytest.mark.parametrize("field", [-40e3, 0.0, 13e3, 44.1e3, 95e3])
@@ -73,9 +73,7 @@ def test_closed_form_is_where_the_energy_is_least(field):
     """To first order: a tenth of field and stress moves moments by a tenth, within a hundredth."""
     weak = replace(RATED, stress_pa=0.1 * RATED.stress_pa)
     work = np.empty((8, 6))
-    domains.equilibrium(
-        field, weak.table(), domains.Domains(weak, Coil(1.0, 0.0, STEP_S))._energies, work
-    )
+    domains.equilibrium(field, weak.table(), weak.energies, work)
     for kind, direction in enumerate(domains.ORIENTATIONS):
         easy = np.array(direction) / math.sqrt(3.0)
 
@@ -111,12 +109,12 @@ def test_compression_turns_domains_across():
 @pytest.mark.parametrize("change", [-300.0, 300.0, 2000.0])
 def test_slopes_are_difference_quotients(change):
     """What Newton's method goes by is what a small change does."""
-    model = domains.Domains(RATED, Coil(1.0, 44.1e3, STEP_S))
+    model = RATED.rods(Coil(1.0, 44.1e3, STEP_S))
     model.rest()
     model.follow(np.linspace(0.0, math.copysign(9e3, change), 801), np.empty(400))
     works = [np.empty((8, 6)) for _ in range(3)]
     found = [
-        domains.magnetise(change + step, model._state, model._table, model._energies, work)
+        domains.magnetise(change + step, model.state, RATED.table(), RATED.energies, work)
         for step, work in zip((-0.1, 0.0, 0.1), works, strict=True)
     ]
     assert found[1][1] == pytest.approx((found[2][0] - found[0][0]) / 0.2, rel=1e-6)
@@ -127,24 +125,24 @@ def test_slopes_are_difference_quotients(change):
 
 def test_fractions_stay_fractions():
     """However it is driven, they are between 0 and 1, and 1 in all."""
-    model = domains.Domains(RATED, Coil(5.09e3, 44.1e3, STEP_S))
+    model = RATED.rods(Coil(5.09e3, 44.1e3, STEP_S))
     model.rest()
     current_a = np.random.default_rng(3).uniform(-10.0, 10.0, 200).repeat(20)
     for part in np.split(current_a, 200):
         model.follow(np.append(part, part[-1]).repeat(1)[:21], np.empty(10))
-        for fractions in model._state[:2]:
+        for fractions in model.state[:2]:
             assert fractions.min() >= 0.0
             assert fractions @ domains.KIND_SIZES == pytest.approx(1.0, abs=1e-9)
 
 
 def test_flux_is_kept():
     """H + M by the flux that came in is what fields and fractions come to, after any motion."""
-    model = domains.Domains(RATED, Coil(5.09e3, 44.1e3, STEP_S))
+    model = RATED.rods(Coil(5.09e3, 44.1e3, STEP_S))
     model.rest()
     n = 4000
     model.follow(7.0 * np.sin(2.0 * np.pi * np.arange(2 * n + 1) / 400.0), np.empty(n))
     work = np.empty((8, 6))
-    domains.equilibrium(model._state[2, 0], model._table, model._energies, work)
-    fractions = 0.1 * model._state[0] + 0.9 * model._state[1]
-    by_fractions = 7.65e5 * float((model._table[0] * fractions) @ work[1]) + model._state[2, 0]
-    assert model._state[2, 1] == pytest.approx(by_fractions, abs=0.1)
+    domains.equilibrium(model.state[2, 0], RATED.table(), RATED.energies, work)
+    fractions = 0.1 * model.state[0] + 0.9 * model.state[1]
+    by_fractions = 7.65e5 * float((RATED.table()[0] * fractions) @ work[1]) + model.state[2, 0]
+    assert model.state[2, 1] == pytest.approx(by_fractions, abs=0.1)

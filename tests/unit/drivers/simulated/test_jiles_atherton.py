@@ -11,7 +11,6 @@ from scipy.optimize import brentq
 from hilctl_drivers.simulated.actuator_base import Coil
 from hilctl_drivers.simulated.jiles_atherton import (
     GrowingLagParameters,
-    JilesAtherton,
     JilesAthertonParameters,
     langevin,
     susceptibility,
@@ -56,9 +55,9 @@ def test_coupling_has_the_stress_in_it():
 @pytest.mark.parametrize("bias", [0.0, 13e3, 44.1e3, 90e3, 1e7])
 def test_rests_on_the_anhysteretic(bias):
     """Which at high fields is saturation."""
-    model = JilesAtherton(RATED, Coil(1.0, bias, STEP_S))
+    model = RATED.rods(Coil(1.0, bias, STEP_S))
     rest_um = model.rest()
-    assert model._state[1] == pytest.approx(anhysteretic(bias), abs=1.0)
+    assert model.state[1] == pytest.approx(anhysteretic(bias), abs=1.0)
     full_um = 1.5 * 1.005e-3 * 0.1206e6
     assert rest_um == pytest.approx(full_um * (anhysteretic(bias) / 7.65e5) ** 2, rel=1e-5)
     if bias == 1e7:
@@ -67,7 +66,7 @@ def test_rests_on_the_anhysteretic(bias):
 
 def test_susceptibility_is_never_negative():
     """Wherever M stands, a field that grows does not make it fall: the one guard there is."""
-    material = JilesAtherton(RATED, Coil(1.0, 0.0, STEP_S))._material
+    material = RATED.material
     for field in np.linspace(-90e3, 90e3, 19):
         for start in np.linspace(-7e5, 7e5, 15):
             assert susceptibility(field, start, 1.0, material) > 0.0
@@ -83,15 +82,15 @@ def test_losses_are_the_published_ones():
         0.1356 * 100.0 * math.pi * 6.15e-3**2 / 0.6e-6 * 4e-7 * math.pi * rate, rel=1e-6
     )
     field = 20e3 + 5e7 * STEP_S * np.arange(60)
-    model = JilesAtherton(RATED, Coil(1.0, 0.0, STEP_S))
+    model = RATED.rods(Coil(1.0, 0.0, STEP_S))
     model.rest()
-    model._state[:] = field[0], anhysteretic(20e3)
+    model.state[:] = field[0], anhysteretic(20e3)
     for k in range(59):
-        before = model._state.copy()
+        before = model.state.copy()
         ends = np.array([field[k], 0.5 * (field[k] + field[k + 1]), field[k + 1]])
         model.follow(ends, np.empty(1))
-    pace = (model._state[1] - before[1]) / STEP_S
-    behind = 0.5 * (field[58] + field[59]) - 0.5 * (model._state[0] + before[0])
+    pace = (model.state[1] - before[1]) / STEP_S
+    behind = 0.5 * (field[58] + field[59]) - 0.5 * (model.state[0] + before[0])
     assert behind == pytest.approx(eddy * pace + wall * math.sqrt(pace), rel=1e-6)
 
 
@@ -130,11 +129,11 @@ def test_is_its_differential_equation(rods, frequency_hz):
     solved = solve_ivp(
         rates, (0.0, times[-1]), start, t_eval=times, rtol=1e-7, atol=1e-3, max_step=STEP_S
     )
-    model = JilesAtherton(rods, Coil(5.09e3, 44.1e3, STEP_S))
+    model = rods.rods(Coil(5.09e3, 44.1e3, STEP_S))
     model.rest()
     found = np.empty(times.size)
     for k in range(times.size):
         halves = STEP_S * (k + np.array([0.0, 0.5, 1.0]))
         model.follow(6.0 * np.sin(2.0 * np.pi * frequency_hz * halves), np.empty(1))
-        found[k] = model._state[1]
+        found[k] = model.state[1]
     assert np.abs(found - solved.y[1]).max() < 0.002 * np.ptp(solved.y[1])

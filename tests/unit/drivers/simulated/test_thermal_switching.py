@@ -7,7 +7,7 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl_drivers.simulated.devices import PiezoOptions, SimulatedPiezo
-from hilctl_drivers.simulated.thermal_switching import SwitchingParameters
+from hilctl_drivers.simulated.thermal_switching import SwitchingActuator, SwitchingParameters
 from tests.unit.drivers.simulated.test_actuator_base import hysteresis_percent, run
 
 # A quick structure and sensor: what is left of the rate is that of the domains.
@@ -25,7 +25,7 @@ def cycles(low_v, high_v, frequency_hz, count, per_cycle=2000):
     """Return drive in V and displacement in um of each cycle, float64[count, n], from rest."""
     phase = 2.0 * np.pi * np.arange(per_cycle * count + 1) / per_cycle
     drive_v = 0.5 * (low_v + high_v) - 0.5 * (high_v - low_v) * np.cos(phase)
-    displacement_um = run(QUICK.plant(frequency_hz * per_cycle, 1), drive_v)
+    displacement_um = run(SwitchingActuator(QUICK, frequency_hz * per_cycle, 1), drive_v)
     return [each[1:].reshape(count, -1) for each in (drive_v, displacement_um)]
 
 
@@ -44,7 +44,7 @@ def test_a_held_drive_creeps_with_the_logarithm_of_time(before_v, sign):
     """Onwards, by 1 to 2 % of the last motion per decade from 0.1 s."""
     rate_hz = 1000.0
     ramps = np.concatenate((np.linspace(0.0, before_v, 30), np.linspace(before_v, 60.0, 30)))
-    plant = QUICK.plant(rate_hz, 1)
+    plant = SwitchingActuator(QUICK, rate_hz, 1)
     turn_um, held_um = run(plant, ramps)[30], run(plant, np.full(101_000, 60.0))
     at = held_um[[100, 1000, 10_000, 100_000]]
     steps = sign * np.diff(at) / abs(at[0] - turn_um)
@@ -58,7 +58,7 @@ def test_a_loop_closes_and_its_remanence_decays():
     stroke_um = np.ptp(displacement_um)
     assert np.abs(displacement_um[1, -100:] - displacement_um[0, -100:]).max() < 0.002 * stroke_um
     drive_v = np.concatenate((np.linspace(0.0, 100.0, 500), np.linspace(100.0, 0.0, 500)))
-    plant = QUICK.plant(1000.0, 1)
+    plant = SwitchingActuator(QUICK, 1000.0, 1)
     remanent_um = run(plant, drive_v)[-1]
     later_um = run(plant, np.zeros(50_000))[-1]
     assert 0.02 * stroke_um < remanent_um < 0.1 * stroke_um
@@ -69,7 +69,7 @@ def test_a_small_loop_leaves_a_large_one_where_it_was():
     """A quick excursion and return ends within 2 % of its size on the branch that it left."""
     ramp = np.linspace(0.0, 60.0, 3000)
     away = np.concatenate((ramp, np.linspace(60.0, 40.0, 100), np.linspace(40.0, 60.0, 100)))
-    plant = QUICK.plant(10e3, 1)
+    plant = SwitchingActuator(QUICK, 10e3, 1)
     displacement_um = run(plant, away)
     size_um = displacement_um[2999] - displacement_um[3099]
     back_um = run(plant, np.full(10, 60.0))[-1]
@@ -81,7 +81,7 @@ def test_integration_has_converged():
     rated = replace(SwitchingParameters(), sensor_noise_um=0.0)
     drive_v = 50.0 - 45.0 * np.cos(2.0 * np.pi * 250.0 * np.arange(600) / 50e3)
     fine = replace(rated, step_max_s=0.1 * rated.step_max_s)
-    one, other = (run(each.plant(50e3, 1), drive_v) for each in (rated, fine))
+    one, other = (run(SwitchingActuator(each, 50e3, 1), drive_v) for each in (rated, fine))
     assert np.abs(one - other).max() < 0.05
 
 
@@ -89,7 +89,7 @@ def test_integration_has_converged():
 def test_cut_does_not_matter(rate_hz):
     """Nor the rate: at a low one a sample period has more steps than a kernel call takes."""
     drive_v = np.random.default_rng(3).uniform(0.0, 100.0, 40)
-    plant = SwitchingParameters().plant(rate_hz, 1)
+    plant = SwitchingActuator(SwitchingParameters(), rate_hz, 1)
     whole = run(plant, drive_v)
     plant.reset()
     parts = [run(plant, part) for part in np.split(drive_v, [1, 2, 17])]
