@@ -72,7 +72,11 @@ def wired_experiment(
     if not isinstance(section, dict) or not isinstance(name, str):
         rule = "must name a profile: what has none is not behind a wire, and needs no emulator"
         raise ConfigError([document.problem("device.profile", rule)])
-    options = _validated(document, path.parent, files)
+    # The options of a device of any protocol: those of serial_dac include all.
+    context = {"folder": path.parent, "files": files}
+    options: DacOptions = document.validate(
+        SerialOptions, at=("device",), without=("kind",), context=context
+    )
     reader = options.reader
     unit = "A" if options.amplifier is None else options.amplifier.command_unit
     made = EmulatorOptions(
@@ -92,12 +96,6 @@ def wired_experiment(
         limits=limited_range(document.data.get("limits")),
     )
     return WiredExperiment(path, section, made)
-
-
-def _validated(document: Document, folder: Path, files: TextFiles) -> DacOptions:
-    """Return the options of a device of any protocol: those of serial_dac include all."""
-    context = {"folder": folder, "files": files}
-    return document.validate(SerialOptions, at=("device",), without=("kind",), context=context)
 
 
 def _found(named: NamedProfile, folder: Path) -> str:

@@ -11,7 +11,6 @@ from hilctl_drivers.modbus.register_map import (
     ExpectStep,
     ModbusSelftest,
     Register,
-    RegisterFormat,
     RegisterStep,
     StatusRegister,
 )
@@ -24,11 +23,7 @@ class Words:
 
     def __init__(self, register: Register) -> None:
         self.register = register
-        self._format = (
-            None
-            if register.type == "bit"
-            else RegisterFormat(register.type, register.order, register.scale, register.offset)
-        )
+        self._format = None if register.type == "bit" else register.format
         self.words = [0] * register.words
 
     def encoded(self, value: float) -> list[int]:
@@ -40,9 +35,9 @@ class Words:
 
     def set_bits(self, mask: int, bits: int) -> None:
         """Replace the bits of a mask."""
-        raw = int.from_bytes(struct.pack(f">{len(self.words)}H", *self.words), "big")
-        data = (raw & ~mask | bits).to_bytes(2 * len(self.words), "big")
-        self.words[:] = struct.unpack(f">{len(self.words)}H", data)
+        for k in range(len(self.words)):
+            shift = 16 * (len(self.words) - 1 - k)
+            self.words[k] = (self.words[k] & ~(mask >> shift) | bits >> shift) & 0xFFFF
 
     @property
     def value(self) -> float:

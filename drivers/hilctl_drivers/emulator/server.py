@@ -12,7 +12,6 @@ import struct
 import termios
 import time
 import tty
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
@@ -27,61 +26,52 @@ from hilctl_drivers.emulator.wire import EmulatedReply, EmulatedWire
 _CHUNK = 65536
 
 
-class _Connection(ABC):
-    """A host's connection to a wire."""
+class _Connection:
+    """A host's connection to a wire, by a descriptor that does not block."""
 
-    def __init__(self, wire: EmulatedWire, *, faulty: bool = True) -> None:
+    def __init__(self, fd: int, wire: EmulatedWire, *, faulty: bool) -> None:
+        self._fd = fd
         self.wire = wire
         self.faulty = faulty  # whether the server's faults happen here
         self.received = bytearray()  # no complete request yet
         self.received_ns = 0
         self.unsent = bytearray()  # waits for room, as in a USB device's buffer
 
-    @abstractmethod
     def fileno(self) -> int:
-        """Descriptor to wait for."""
+        """Return the descriptor to wait for."""
+        return self._fd
 
-    @abstractmethod
     def read(self) -> bytes | None:
         """Return the received bytes; None if the host has closed the connection."""
+        try:
+            return os.read(self._fd, _CHUNK) or None
+        except BlockingIOError:
+            return b""
+        except OSError:  # a host that died is as good as one that hung up
+            return None
 
     def send(self, data: bytes) -> None:
         """Send as much as there is room for; the rest with the next call."""
         self.unsent += data
         with suppress(OSError):  # no room, or the host has gone
             while self.unsent:
-                del self.unsent[: self._write(self.unsent)]
+                del self.unsent[: os.write(self._fd, self.unsent)]
 
-    @abstractmethod
-    def _write(self, data: bytes | bytearray) -> int:
-        """Send without waiting; return the number of bytes that there was room for."""
-
-    def unplug(self) -> None:  # noqa: B027  a pulled network cable closes nothing
+    def unplug(self) -> None:
         """Be silent for good; :meth:`close` is still called."""
 
-    @abstractmethod
     def close(self, *, reset: bool = False) -> None:
         """Close the connection, or break it."""
 
 
 class _TcpConnection(_Connection):
-    """An accepted connection."""
+    """An accepted connection; a pulled network cable closes nothing."""
 
     def __init__(self, connection: socket.socket, wire: EmulatedWire) -> None:
-        super().__init__(wire)
         connection.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
+        connection.setblocking(False)
+        super().__init__(connection.fileno(), wire, faulty=True)
         self._connection = connection
-
-    def fileno(self) -> int:
-        return self._connection.fileno()
-
-    def read(self) -> bytes | None:
-        with suppress(OSError):  # a host that died is as good as one that hung up
-            return self._connection.recv(_CHUNK) or None
-        return None
-
-    def _write(self, data: bytes | bytearray) -> int:
-        return self._connection.send(data, socket.MSG_DONTWAIT)
 
     def close(self, *, reset: bool = False) -> None:
         if reset:
@@ -94,31 +84,20 @@ class _PtyConnection(_Connection):
     """Connection to the program at the other end of a pty; there is nothing to reset."""
 
     def __init__(self, wire: EmulatedWire, *, faulty: bool) -> None:
-        super().__init__(wire, faulty=faulty)
         # Kept open, so that the line does not end when a host closes it.
-        self._master, self._slave = pty.openpty()
+        master, self._slave = pty.openpty()
+        super().__init__(master, wire, faulty=faulty)
         tty.setraw(self._slave, termios.TCSANOW)
-        os.set_blocking(self._master, False)
+        os.set_blocking(master, False)
         self.name = os.ttyname(self._slave)
 
-    def fileno(self) -> int:
-        return self._master
-
-    def read(self) -> bytes | None:
-        with suppress(BlockingIOError):
-            return os.read(self._master, _CHUNK)
-        return b""
-
-    def _write(self, data: bytes | bytearray) -> int:
-        return os.write(self._master, data)
-
     def unplug(self) -> None:
-        os.close(self._master)  # a pulled adapter takes its port along
-        self._master = -1
+        os.close(self._fd)  # a pulled adapter takes its port along
+        self._fd = -1
 
     def close(self, *, reset: bool = False) -> None:
-        if self._master >= 0:
-            os.close(self._master)
+        if self._fd >= 0:
+            os.close(self._fd)
         # Last: until then no other pty gets its name, which a host may still be trying.
         os.close(self._slave)
 
