@@ -33,30 +33,20 @@ STEP = 0.01
 class DrivenDevice:
     """A device and how to use it.
 
-    Attributes:
-        device: Not yet open.
-        block: Samples it takes in one exchange.
-        rate_hz: A sample rate that it can keep.
-        stands: Returns its output as a command, if possible that of the emulated device or the
-            simulated plant; None if it is not known.
-        pass_time: Called before each exchange.
-        exchanged: Samples since it was opened.
-        name: Its registry name; empty if it has none yet.
-        starts_at_rest: Whether opening it starts anew, as a simulation does.
-        must_be_at_rest: Whether opening is refused unless its output is 0.
-        reads_back: Whether it can read its output back; None if either is allowed.
+    ``stands`` returns its output as a command, if possible that of the emulated device or the
+    simulated plant; None if it is not known.
     """
 
-    device: Device
-    block: int
-    rate_hz: float
+    device: Device  # not yet open
+    block: int  # samples it takes in one exchange
+    rate_hz: float  # a sample rate that it can keep
     stands: Callable[[], float | None]
-    pass_time: Callable[[], None] = lambda: None
-    exchanged: int = 0
-    name: str = ""
-    starts_at_rest: bool = False
-    must_be_at_rest: bool = False
-    reads_back: bool | None = True
+    pass_time: Callable[[], None] = lambda: None  # called before each exchange
+    exchanged: int = 0  # samples since it was opened
+    name: str = ""  # its registry name; empty if it has none yet
+    starts_at_rest: bool = False  # whether opening it starts anew, as a simulation does
+    must_be_at_rest: bool = False  # whether opening is refused unless its output is 0
+    reads_back: bool | None = True  # whether it can read its output back; None if either is allowed
 
     def open(self) -> None:
         """Open and arm the device, as a run does; the next sample is the first."""

@@ -50,31 +50,18 @@ class AuxSource:
 
 @dataclass(frozen=True, slots=True)
 class DacSetup:
-    """An experiment's options, resolved against the profiles.
-
-    Attributes:
-        options: The options.
-        writer: The device that has the output.
-        reader: The device that has the input; the same object if it is the same device.
-        output: The output in use.
-        input: The input in use.
-        chain: Amplifier and sensor.
-        measure: The input that measures the output; None if it is not measured.
-        aux: The auxiliary channels.
-        digital_output: Digital output of the writer for triggers; None without one.
-        digital_input: Its digital input for triggers; None without one.
-    """
+    """An experiment's options, resolved against the profiles."""
 
     options: DacOptions
-    writer: Endpoint
-    reader: Endpoint
-    output: Range
-    input: Range
-    chain: SignalChain
-    measure: Any
-    aux: tuple[AuxSource, ...]
-    digital_output: Any
-    digital_input: Any
+    writer: Endpoint  # the device that has the output
+    reader: Endpoint  # the device that has the input; the same object if it is the same device
+    output: Range  # the output in use
+    input: Range  # the input in use
+    chain: SignalChain  # amplifier and sensor
+    measure: Any  # the input that measures the output; None if it is not measured
+    aux: tuple[AuxSource, ...]  # the auxiliary channels
+    digital_output: Any  # digital output of the writer for triggers; None without one
+    digital_input: Any  # its digital input for triggers; None without one
 
     @classmethod
     def of(cls, options: DacOptions) -> Self:
@@ -136,19 +123,17 @@ class DacSetup:
             found.append(partial(each.value, own.reader_on(shared)))
         return found
 
-    def digital_session(self, link: Link) -> Any:
-        """Return the session with the digital channels; None if none is in use."""
-        if self.digital_output is None and self.digital_input is None:
-            return None
-        return cast("type[SessionReader]", _reader_class(self.writer)).session_on(self.writer, link)
+    @property
+    def session_class(self) -> "type[SessionReader]":
+        """Sessions of the protocol of a writer whose profile has steps."""
+        return cast("type[SessionReader]", _reader_class(self.writer))
 
     @property
     def digital_time(self) -> WireTime | None:
         """Time to set the digital output; None without one."""
         if self.digital_output is None:
             return None
-        reader = cast("type[SessionReader]", _reader_class(self.writer))
-        return reader.digital_time(self.writer.profile, self.digital_output)
+        return self.session_class.digital_time(self.writer.profile, self.digital_output)
 
     def check_timeout(self, wire: WireTime) -> None:
         """Raise InputError if an answer cannot come within the timeout."""
@@ -373,6 +358,28 @@ class SessionReader(SensorReader):
     @abstractmethod
     def digital_time(profile: Any, output: Any) -> WireTime:
         """Return the time of setting a digital output."""
+
+    @staticmethod
+    @abstractmethod
+    def steps_time(profile: Any, steps: Any) -> WireTime:
+        """Return the longest time of steps; a step that may write counts as one that does."""
+
+    @classmethod
+    def feed_time(cls, profile: Any) -> WireTime | None:
+        """Return the time to feed the device's watchdog once; None if exchanges feed it."""
+        watchdog = profile.watchdog
+        if watchdog == "none" or watchdog.kick != "strict":
+            return None
+        return cls.steps_time(profile, watchdog.feed).named("to feed the watchdog")
+
+    @classmethod
+    def arm_s(cls, profile: Any, output: str) -> float:
+        """Return the longest time to arm the device's watchdog, s; 0 without a watchdog."""
+        watchdog = profile.watchdog
+        if watchdog == "none":
+            return 0.0
+        steps = (*getattr(watchdog, "unlock", ()), *watchdog.arming(output))
+        return cls.steps_time(profile, steps).answered_s
 
     def _identify(self) -> None:
         self._session.check_selftest()

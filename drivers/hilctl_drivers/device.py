@@ -13,7 +13,7 @@ from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from pathlib import Path
-from typing import TYPE_CHECKING, Annotated, Any, ClassVar, TypeAlias
+from typing import Annotated, Any, ClassVar, TypeAlias
 
 import numpy as np
 from pydantic import PlainSerializer, PlainValidator
@@ -25,9 +25,6 @@ from hilctl.base.files import TextFiles
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document, option_file
 from hilctl_drivers.transport.wire_time import RateLimit
-
-if TYPE_CHECKING:  # it imports this module
-    from hilctl_drivers.dac_setup import SensorReader
 
 _SHORT = 64
 
@@ -44,7 +41,6 @@ class DacDevice(ABC):
 
     Options: ClassVar[type[DeviceOptions]]
     block_max = 1  # samples of one exchange
-    _reader: "SensorReader | None" = None
 
     def __init__(self, info: DeviceInfo, title: str, action: str, output: str) -> None:
         self._curve: tuple[F64, F64] | None = None
@@ -71,16 +67,6 @@ class DacDevice(ABC):
         self._block = 0  # samples in each exchange; 0 while it is not open
         self.transactions = 0
         """Requests of one exchange, known once it is open; 0 if it sends none."""
-
-    @property
-    def reading_age_s(self) -> float:
-        """See :attr:`hilctl.base.device.AgingDevice.reading_age_s`."""
-        return math.nan if self._reader is None else self._reader.age_s
-
-    @property
-    def lost_readings(self) -> int:
-        """See :attr:`hilctl.base.device.AgingDevice.lost_readings`."""
-        return 0 if self._reader is None else self._reader.lost
 
     @property
     def info(self) -> DeviceInfo:
@@ -127,8 +113,6 @@ class DacDevice(ABC):
             raise self._error(action, "not open")
         try:
             self._arm()
-            if self._reader is not None:
-                self._reader.start()
         except DeviceError as error:
             raise self._failed(action, error, self._abandon) from None
 

@@ -16,25 +16,15 @@ _OF_LINK = (*LINE, *PORT, *STREAM)
 
 @dataclass(frozen=True, slots=True)
 class Endpoint:
-    """A device and its address.
+    """A device and its address."""
 
-    Attributes:
-        name: Its profile's name in the experiment.
-        profile: Its profile, with the experiment's settings of the line.
-        unit: Its address on a shared line; None if it has none.
-        host: Host name or address; empty on a serial port.
-        port: TCP port, or device file of the serial port.
-        framing: Frames of Modbus, ``tcp`` or ``rtu``; empty for other protocols.
-        timeout_s: Longest wait for one answer.
-    """
-
-    name: str
-    profile: BaseProfile
-    unit: int | None
-    host: str
-    port: int | str
-    framing: str
-    timeout_s: float
+    name: str  # its profile's name in the experiment
+    profile: BaseProfile  # its profile, with the experiment's settings of the line
+    unit: int | None  # its address on a shared line; None if it has none
+    host: str  # host name or address; empty on a serial port
+    port: int | str  # TCP port, or device file of the serial port
+    framing: str  # frames of Modbus, ``tcp`` or ``rtu``; empty for other protocols
+    timeout_s: float  # longest wait for one answer
 
     @classmethod
     def of(cls, options: AddressOptions, timeout_s: float, above: str = "") -> "Endpoint":

@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Iterator, Mapping
-from typing import Annotated, ClassVar, Literal, Self, TypeAlias
+from typing import Annotated, Any, ClassVar, Generic, Literal, Self, TypeAlias, TypeVar
 
 from pydantic import Field, StringConstraints, model_validator
 
@@ -200,6 +200,28 @@ class Watchdog(StrictModel):
         return counts
 
 
+Step = TypeVar("Step")
+
+
+class SteppedWatchdog(Watchdog, Generic[Step]):
+    """A watchdog that is set by steps of the protocol."""
+
+    arm: tuple[Step, ...] = Field(min_length=1, description="steps that set and start the watchdog")
+    disarm: tuple[Step, ...] = Field(default=(), description="steps that stop the watchdog")
+    feed: tuple[Step, ...] = Field(default=(), description="steps that feed a strict watchdog")
+    clear: tuple[Step, ...] = Field(default=(), description="steps that clear a trip")
+    safe: dict[Name, tuple[Step, ...]] = Field(
+        default={}, description="steps that set the safe value, per output"
+    )
+
+    def arming(self, output: str) -> tuple[Step, ...]:
+        """Return all steps that arm it, with the safe value of an output first.
+
+        Once the timeout counts, the watchdog must know where to go.
+        """
+        return (*self.safe.get(output, ()), *self.arm)
+
+
 class WaitStep(StrictModel):
     """Wait for the device to settle."""
 
@@ -208,18 +230,28 @@ class WaitStep(StrictModel):
     note: str = Field(default="", description="comment")
 
 
+def parts_of(part: object, key: str = "") -> Iterator[tuple[str, object]]:
+    """Yield the dotted key and the value of a part of a profile, and of all parts below it."""
+    yield key, part
+    parts: dict[Any, object] = {}
+    if isinstance(part, StrictModel):
+        parts = {name: getattr(part, name) for name in type(part).model_fields}
+    elif isinstance(part, dict):
+        parts = part
+    elif isinstance(part, tuple):
+        parts = dict(enumerate(part))
+    for name, each in parts.items():
+        yield from parts_of(each, f"{key}.{name}" if key else f"{name}")
+
+
 class BaseProfile(StrictModel):
     """Keys of every profile, for any protocol.
 
     Subclasses narrow ``link``, ``outputs``, ``inputs`` and ``watchdog`` to their protocol.
-
-    Attributes:
-        DEVICE: Device kind of an experiment that uses such a profile.
-        READER: The :class:`~hilctl_drivers.dac_setup.SensorReader` of its inputs.
     """
 
-    DEVICE: ClassVar[str]
-    READER: ClassVar[str]
+    DEVICE: ClassVar[str]  # device kind of an experiment that uses such a profile
+    READER: ClassVar[str]  # the :class:`~hilctl_drivers.dac_setup.SensorReader` of its inputs
 
     vendor: Text = Field(description="manufacturer")
     model: Text = Field(description="model, as ordered")

@@ -23,23 +23,17 @@ _Channel = TypeVar("_Channel", bound=Range)
 
 @dataclass(slots=True)
 class StartingSection:
-    """A device section to begin with.
+    """A device section to begin with."""
 
-    Attributes:
-        title: The device.
-        values: The section, ``kind`` first.
-        remarks: Comment behind a value, by dotted key of the section.
-        asked: Question to the user, by dotted key of a value that depends on the rig.
-        choices: Names of the channels, for each key that has several.
-        notes: Notes of the profile on wiring.
-    """
-
-    title: str
-    values: dict[str, Any]
+    title: str  # the device
+    values: dict[str, Any]  # the section, ``kind`` first
+    # Comment behind a value, by dotted key of the section.
     remarks: dict[str, str] = field(default_factory=dict)
+    # Question to the user, by dotted key of a value that depends on the rig.
     asked: dict[str, str] = field(default_factory=dict)
+    # Names of the channels, for each key that has several.
     choices: dict[str, tuple[str, ...]] = field(default_factory=dict)
-    notes: tuple[str, ...] = ()
+    notes: tuple[str, ...] = ()  # notes of the profile on wiring
 
 
 def starting_section(

@@ -6,6 +6,7 @@ one request and its reply, or two if writing and reading are separate. No reques
 last reply has come, and the line is drained after a timeout.
 """
 
+import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
 from pkgutil import resolve_name
@@ -13,33 +14,30 @@ from typing import Any, ClassVar
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
-from hilctl_drivers.dac_setup import DacSetup
+from hilctl.base.types import F64
+from hilctl_drivers.dac_setup import DacSetup, SensorReader
 from hilctl_drivers.device import DacDevice
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, Measure
 from hilctl_drivers.transport.links import Link
 from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back
 from hilctl_drivers.transport.stream_link import StreamLink
-from hilctl_drivers.transport.wire_time import check_feeds
+from hilctl_drivers.transport.wire_time import WireTime, check_feeds
 
 _PROMPT_S = 0.2
 """A longer delay of the safe value is mentioned in ``safe_note``."""
 
 
 class WiredDac(DacDevice):
-    """A DAC with a profile, on a link, and the session that reads its sensor.
+    """A DAC with a profile, on a link, and the session that reads its sensor."""
 
-    Attributes:
-        KIND: Its kind in experiments.
-        ACTION: An exchange in messages.
-    """
-
-    KIND: ClassVar[str]
-    ACTION: ClassVar[str] = "write {output}, read {input}"
+    KIND: ClassVar[str]  # its kind in experiments
+    ACTION: ClassVar[str] = "write {output}, read {input}"  # an exchange in messages
     fifo_depth = 0  # samples; 0 without a FIFO
     measures = False  # whether exchanges fill ``measured``
     longest_message_s = 0.0  # longest delay of the safe value by a running exchange
     arm_s = 0.0  # longest time to arm the watchdog
     unconfirmed = ""  # why a written value cannot be confirmed; empty if it can
+    _reader: SensorReader | None = None  # None if the input is read with each exchange
 
     def __init__(self, options: Any, link: Link | None = None) -> None:
         """Describe the device, on a new link or the given one; nothing is sent before :meth:`open`.
@@ -57,7 +55,6 @@ class WiredDac(DacDevice):
         title = f"{self.KIND} {setup.writer.name} at {setup.writer.place}"
         action = self.ACTION.format(output=options.output, input=options.input)
         super().__init__(self._describe(), title, action, options.output)
-        self._digital = setup.digital_session(self._link)
 
     @abstractmethod
     def _prepare(self) -> None:
@@ -98,23 +95,28 @@ class WiredDac(DacDevice):
         self._feed_every = ticks if has != "none" and has.kick == "strict" else 0
         self._ticks = 0
 
-    def _feed(self) -> None:
-        """Feed a watchdog that exchanges do not feed, three times in its timeout."""
-        self._ticks += 1
-        if self._feed_every and self._ticks % self._feed_every == 0:
-            self._run_feed_steps()
+    @property
+    def reading_age_s(self) -> float:
+        """See :attr:`hilctl.base.device.AgingDevice.reading_age_s`."""
+        return math.nan if self._reader is None else self._reader.age_s
 
-    def _run_feed_steps(self) -> None:
-        """Run the steps that feed the watchdog, if it has any."""
+    @property
+    def lost_readings(self) -> int:
+        """See :attr:`hilctl.base.device.AgingDevice.lost_readings`."""
+        return 0 if self._reader is None else self._reader.lost
+
+    def _arm(self) -> None:
+        if self._options.watchdog != "none":
+            self._arm_watchdog()
+        if self._reader is not None:
+            self._reader.start()
+
+    @abstractmethod
+    def _arm_watchdog(self) -> None:
+        """Arm the watchdog that the experiment wants, if the device has one."""
 
     def _readers_of_aux(self) -> Sequence[Callable[[], float]]:
         return self._setup.aux_readers(self._link, self._reader)
-
-    def _set_digital(self, high: bool) -> None:
-        self._digital.set_digital(self._setup.digital_output, high=high)
-
-    def _read_digital(self) -> bool:
-        return bool(self._digital.is_high(self._setup.digital_input))
 
     def _output(self) -> float | None:
         held = self._held()
@@ -159,6 +161,66 @@ class WiredDac(DacDevice):
         self._link.close()
         if self._reader is not None:
             self._reader.release()
+
+
+class SteppedDac(WiredDac):
+    """A DAC whose session runs the steps of its profile."""
+
+    _reader: SensorReader
+
+    def _prepare(self) -> None:
+        setup = self._setup
+        self._profile: Any = setup.writer.profile
+        self._target: Any = setup.output
+        self._writer: Any = setup.session_class.session_on(setup.writer, self._link)
+        self._reader = setup.reader_on(self._link)
+        self.arm_s = setup.session_class.arm_s(self._profile, self._options.output)
+        self._measure: Callable[[], float] | None = None
+        if setup.measure is not None:
+            self.measures = True
+            self._measure = self._writer.input_reader(setup.measure)
+            self._measured_by = setup.chain.measured(setup.measure)
+
+    @abstractmethod
+    def _run(self, name: str) -> None:
+        """Run the steps of the experiment's watchdog that have that name."""
+
+    def _feed(self) -> None:
+        """Feed a watchdog that exchanges do not feed, three times in its timeout."""
+        self._ticks += 1
+        if self._feed_every and self._ticks % self._feed_every == 0:
+            self._run("feed")
+
+    def _measure_output(self, measured: F64) -> None:
+        """Fill in the command that the output is measured at, if it is measured."""
+        if self._measure is not None:
+            gain, offset = self._measured_by
+            measured[0] = self._measure() * gain + offset
+
+    def _feed_time(self) -> WireTime | None:
+        """Return the time to feed the watchdog of the experiment once; None if nothing is sent."""
+        if self._options.watchdog == "none":
+            return None
+        return self._setup.session_class.feed_time(self._profile)
+
+    def _connect(self) -> None:
+        """Connect and check that the devices are the right ones."""
+        self._link.open()
+        self._writer.check_selftest()
+        self._reader.open()
+
+    def _set_digital(self, high: bool) -> None:
+        self._writer.set_digital(self._setup.digital_output, high=high)
+
+    def _read_digital(self) -> bool:
+        return bool(self._writer.is_high(self._setup.digital_input))
+
+    def _close(self) -> None:
+        # First: nothing feeds it any more, and it would trip while the close steps run.
+        if self._options.watchdog != "none":
+            self._run("disarm")
+        self._writer.run(self._profile.close)
+        self._reader.end()
 
 
 class SerialOptions(DacOptions):

@@ -22,15 +22,15 @@ from pymodbus.pdu.register_message import (
 from hilctl_drivers.ascii.ascii_session import LineFormat, parse_number
 from hilctl_drivers.modbus.modbus_session import RtuTransaction, TcpTransaction
 from hilctl_drivers.modbus.pdu import (
-    ReadFrame,
-    WriteFrame,
     feedback_pdu,
+    read_frame,
     read_pdu,
     reply_data,
     rtu_adu,
     rtu_pdu,
     tcp_adu,
     tcp_pdu,
+    write_frame,
     write_pdu,
     write_read_pdu,
     write_single_pdu,
@@ -321,7 +321,7 @@ PDUS = {
         rng.randrange(65000), 2, rng.randrange(65000), rng.randbytes(4)
     ),
     "feedback": lambda rng: feedback_pdu(
-        ReadFrame(rng.randrange(65000), 2), WriteFrame(rng.randrange(65000), rng.randbytes(4))
+        read_frame(rng.randrange(65000), 2), write_frame(rng.randrange(65000), rng.randbytes(4))
     ),
 }
 SUBJECTS = {

@@ -6,18 +6,10 @@ from string import Formatter
 
 from hilctl.base.errors import UnconfirmedError
 from hilctl.base.types import F64
-from hilctl_drivers.ascii.ascii_profile import (
-    AsciiInput,
-    AsciiOutput,
-    AsciiProfile,
-    binary_format,
-    fill,
-)
+from hilctl_drivers.ascii.ascii_profile import AsciiOutput, AsciiProfile, binary_format, fill
 from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
-    arm_s,
     exchange_time,
-    feed_time,
     parse_number,
     query_time,
     reading,
@@ -25,7 +17,7 @@ from hilctl_drivers.ascii.ascii_session import (
 from hilctl_drivers.transport.links import WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import try_out
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
-from hilctl_drivers.wired_dac import SerialDac
+from hilctl_drivers.wired_dac import SerialDac, SteppedDac
 
 _NO_EVIDENCE = (
     "the device cannot confirm it: it does not answer, or repeats what it is sent, and its profile "
@@ -33,27 +25,23 @@ _NO_EVIDENCE = (
 )
 
 
-class AsciiDac(SerialDac):
+class AsciiDac(SteppedDac, SerialDac):
     """A :class:`~hilctl_drivers.wired_dac.SerialDac` with lines of text or fixed frames."""
 
+    _profile: AsciiProfile
+    _target: AsciiOutput
+    _writer: AsciiSession
+
     def _prepare(self) -> None:
-        setup, options = self._setup, self._options
-        profile, output = setup.writer.profile, setup.output
-        assert isinstance(profile, AsciiProfile)
-        assert isinstance(output, AsciiOutput)
-        self._profile, self._target = profile, output
-        self._measure: AsciiInput | None = setup.measure
-        self.measures = self._measure is not None
-        self._writer = AsciiSession(profile, self._link, setup.writer.unit)
-        self._sensor = self._reader = setup.reader_on(self._link)
+        super()._prepare()
+        setup = self._setup
         # Half duplex: what was asked last is answered before the safe value can go out.
-        write = exchange_time(profile, options.output, None)
+        write = exchange_time(self._profile, self._options.output, None)
         busy = self._own_time()
         if setup.shares_link or setup.aux or setup.digital_output:
             busy = setup.after_reading(busy)
         self.longest_message_s = busy.answered_s + write.answered_s
         self.unconfirmed = self._unconfirmed()
-        self.arm_s = arm_s(profile, options.output)
 
     def _rates(self, block: int) -> RateLimit:
         del block
@@ -64,10 +52,10 @@ class AsciiDac(SerialDac):
         options, profile = self._options, self._profile
         own = None if self._setup.reads_elsewhere else options.input
         wire = exchange_time(profile, options.output, own)
-        if self._measure is not None:
+        if self._setup.measure is not None:
             purpose = f"to measure {options.measure}"
-            wire = wire.then(query_time(profile, self._measure).named(purpose))
-        return wire if options.watchdog == "none" else wire.then(feed_time(profile))
+            wire = wire.then(query_time(profile, self._setup.measure).named(purpose))
+        return wire.then(self._feed_time())
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         del block
@@ -76,17 +64,14 @@ class AsciiDac(SerialDac):
         # A device that has tripped refuses the steps that follow.
         self._clear_trip()
         self._writer.run(self._profile.init)
-        self._sensor.begin()
+        self._reader.begin()
         self._try_out_safe_value()
         self._writer.check_errors()  # after all steps: those without a reply leave theirs there
         self.transactions = (1 if self._is_combined else 2) + self.measures
 
-    def _arm(self) -> None:
-        if self._options.watchdog != "none":
-            # The safe value before the timeout: once it counts, it must know where to go.
-            self._run("safe")
-            self._run("arm")
-            self._writer.check_errors()  # commands without a reply leave theirs there
+    def _arm_watchdog(self) -> None:
+        self._run("arming")
+        self._writer.check_errors()  # commands without a reply leave theirs there
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
@@ -100,12 +85,10 @@ class AsciiDac(SerialDac):
             found = self._profile.inputs[combined.input].value(number)
         else:
             # First the reading, which must not show yet what the command does.
-            found = self._sensor.read()
+            found = self._reader.read()
             self._write(value)
         displacement_um[0] = self._chain.displacement_um(found)
-        if self._measure is not None:
-            gain, offset = self._chain.measured(self._measure)
-            measured[0] = self._writer.value(self._measure) * gain + offset
+        self._measure_output(measured)
         self._feed()
 
     def _held(self) -> float | None:
@@ -119,17 +102,13 @@ class AsciiDac(SerialDac):
 
     def _look(self) -> tuple[float, float | None]:
         self._connect()
-        displacement_um = self._chain.displacement_um(self._sensor.read())
+        displacement_um = self._chain.displacement_um(self._reader.read())
         output = self._measured_output()
         return displacement_um, None if output is None else self._chain.command(output)
 
     def _close(self) -> None:
-        if self._options.watchdog != "none":
-            # First: nothing feeds it any more, and it would trip while the close steps run.
-            self._run("disarm")
-        self._writer.run(self._profile.close)
+        super()._close()
         self._writer.check_errors()
-        self._sensor.end()
 
     @property
     def _is_combined(self) -> bool:
@@ -137,12 +116,6 @@ class AsciiDac(SerialDac):
         if combined == "none" or self._setup.reads_elsewhere:
             return False
         return (combined.output, combined.input) == (options.output, options.input)
-
-    def _connect(self) -> None:
-        """Open the links and check the devices."""
-        self._link.open()
-        self._writer.check_selftest()
-        self._sensor.open()
 
     def _write(self, value: float) -> bool:
         """Write the output; return whether the answer shows that a device has received it."""
@@ -230,18 +203,12 @@ class AsciiDac(SerialDac):
         self._confirm(safe)
 
     def _run(self, name: str) -> None:
-        """Run the watchdog's steps of that name."""
         watchdog, options = self._profile.watchdog, self._options
         assert watchdog != "none"
-        steps = getattr(watchdog, name)
-        if name == "safe":
-            steps = steps.get(options.output, ())
+        steps = watchdog.arming(options.output) if name == "arming" else getattr(watchdog, name)
         counts = watchdog.counts(options.watchdog_timeout_s or watchdog.min_s)
         safe = self._target.number(self._chain.output(options.safe_command))
         self._writer.run(steps, timeout=counts, safe=safe)
-
-    def _run_feed_steps(self) -> None:
-        self._run("feed")
 
 
 def _without_numbers(text: str) -> str:

@@ -19,7 +19,7 @@ from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import cache
 from string import Formatter
-from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias, cast, get_args
+from typing import Annotated, ClassVar, Literal, Self, TypeAlias, cast, get_args
 
 from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
@@ -31,9 +31,11 @@ from hilctl_drivers.profile_base import (
     Name,
     Range,
     SerialLineSettings,
+    SteppedWatchdog,
     StreamSettings,
+    Text,
     WaitStep,
-    Watchdog,
+    parts_of,
 )
 from hilctl_drivers.transport.crc import CrcName
 from hilctl_drivers.transport.links import BadRequestError
@@ -203,6 +205,13 @@ class Reply(StrictModel):
         return pattern_of(self.pattern)[0].fullmatch(text)
 
 
+AnyReply: TypeAlias = Annotated[
+    Reply | Literal["none"], Field(description="form of a good reply; none if there is none")
+]
+Ask: TypeAlias = Annotated[LineTemplate, Field(description="line that is sent")]
+Note: TypeAlias = Annotated[str, Field(description="purpose of the step")]
+
+
 class NumberReply(Reply):
     """A reply with a number: the pattern's first group."""
 
@@ -237,7 +246,7 @@ class MeasuredReply(NumberReply):
 class Query(NumberReply):
     """A query with a number as its reply."""
 
-    ask: LineTemplate = Field(description="line that is sent")
+    ask: Ask
 
 
 class Readback(Query):
@@ -277,9 +286,7 @@ class AsciiOutput(ScaledRange):
     write: LineTemplate = Field(
         description="sets it; {value:.4f} is (value - offset) / scale with 4 decimals"
     )
-    reply: Reply | Literal["none"] = Field(
-        description="form of a good reply; none if there is none"
-    )
+    reply: AnyReply
     readback: Readback | Literal["none"] = Field(
         default="none", description="query of the applied value, to confirm the safe value"
     )
@@ -337,15 +344,13 @@ class AsciiDigitalOutput(StrictModel):
 
     high: LineTemplate = Field(description="line that sets it high")
     low: LineTemplate = Field(description="line that sets it low")
-    reply: Reply | Literal["none"] = Field(
-        description="form of a good reply to both; none if there is none"
-    )
+    reply: AnyReply
 
 
 class AsciiDigitalInput(StrictModel):
     """A digital input, read with a line of text or a frame."""
 
-    ask: LineTemplate = Field(description="line that is sent")
+    ask: Ask
     high: Reply = Field(description="form of the reply if it is high")
     low: Reply = Field(description="form of the reply if it is low")
 
@@ -359,60 +364,41 @@ class AsciiDigitalInput(StrictModel):
 
 
 class AsciiExchange(MeasuredReply):
-    """One write that sets an output and reads an input.
+    """One write that sets an output and reads an input."""
 
-    Attributes:
-        output: Name of the output.
-        input: Name of the input.
-        write: Line or lines that are sent, with {value}, the number of the output.
-    """
-
-    output: Name
-    input: Name
-    write: LineTemplate
+    output: Name = Field(description="name of the output")
+    input: Name = Field(description="name of the input")
+    write: LineTemplate = Field(
+        description="line or lines that are sent, with {value}, the number of the output"
+    )
 
 
 class SendStep(StrictModel):
-    """Send a line.
-
-    Attributes:
-        text: The line.
-        reply: Form of a good reply; none if there is none.
-        note: Purpose of the step.
-    """
+    """Send a line."""
 
     kind: Literal["send"]
-    text: LineTemplate
-    reply: Reply | Literal["none"] = "none"
-    note: str = ""
+    text: Ask
+    reply: AnyReply = "none"
+    note: Note = ""
 
 
 class AskStep(Reply):
-    """Send a query, and stop if the reply does not match.
-
-    Attributes:
-        ask: Line that is sent.
-        note: Purpose of the step.
-    """
+    """Send a query, and stop if the reply does not match."""
 
     kind: Literal["ask"]
-    ask: LineTemplate
-    note: str = ""
+    ask: Ask
+    note: Note = ""
 
 
 class NumberStep(Query):
-    """Query a number, and stop if it is not near ``value``.
-
-    Attributes:
-        value: Expected number, or ``safe`` for the safe value.
-        tolerance: Largest difference.
-        note: Purpose of the step.
-    """
+    """Query a number, and stop if it is not near ``value``."""
 
     kind: Literal["number"]
-    value: float | Literal["safe"]
-    tolerance: float = Field(ge=0.0)
-    note: str = ""
+    value: float | Literal["safe"] = Field(
+        description="expected number, or safe for the safe value"
+    )
+    tolerance: float = Field(ge=0.0, description="largest difference")
+    note: Note = ""
 
 
 AsciiStep: TypeAlias = Annotated[
@@ -421,41 +407,20 @@ AsciiStep: TypeAlias = Annotated[
 
 
 class ErrorReply(Reply):
-    """A reply that reports an error, whatever was sent.
+    """A reply that reports an error, whatever was sent."""
 
-    Attributes:
-        meaning: Meaning of the error, in messages.
-    """
-
-    meaning: Annotated[str, StringConstraints(min_length=1)]
+    meaning: Text = Field(description="meaning of the error, in messages")
 
 
 class Check(Reply):
-    """A query whose reply matches, or not.
+    """A query whose reply matches, or not."""
 
-    Attributes:
-        ask: Line that is sent.
-    """
-
-    ask: LineTemplate
+    ask: Ask
 
 
-class AsciiWatchdog(Watchdog):
-    """A host watchdog set by lines of text; {timeout} is in counts, {safe} a number as in write.
+class AsciiWatchdog(SteppedWatchdog[AsciiStep]):
+    """A host watchdog set by lines of text; {timeout} is in counts, {safe} a number as in write."""
 
-    Attributes:
-        arm: Steps that arm it.
-        disarm: Steps that disarm it.
-        feed: Steps that feed it between exchanges.
-        clear: Steps that clear a trip.
-        safe: Steps that set the safe value of each output.
-    """
-
-    arm: tuple[AsciiStep, ...] = Field(min_length=1)
-    disarm: tuple[AsciiStep, ...] = ()
-    feed: tuple[AsciiStep, ...] = ()
-    clear: tuple[AsciiStep, ...] = ()
-    safe: dict[Name, tuple[AsciiStep, ...]] = Field(default={})
     tripped: Check | Literal["none"] = Field(
         default="none", description="query whether the watchdog has tripped"
     )
@@ -471,37 +436,35 @@ class AsciiWatchdog(Watchdog):
 
 
 class AsciiProfile(BaseProfile):
-    """A device with a text protocol or fixed frames.
-
-    Attributes:
-        link: Serial line or TCP connection.
-        outputs: Outputs by name.
-        inputs: Inputs by name.
-        exchange: Lines that write and read in one transaction; none if there are none.
-        digital_outputs: Digital outputs by name, for pulses at marks of the waveform.
-        digital_inputs: Digital inputs by name, for the start of a run.
-        init: Steps after the device is identified.
-        close: Steps before the port is closed.
-        watchdog: Host watchdog; none if it has none.
-    """
+    """A device with a text protocol or fixed frames."""
 
     DEVICE: ClassVar[str] = "serial_dac"
     READER: ClassVar[str] = "hilctl_drivers.ascii.ascii_session:TextReader"
 
-    link: Annotated[AsciiLink | AsciiTcpLink | BytesLink, Field(discriminator="kind")]
+    link: Annotated[AsciiLink | AsciiTcpLink | BytesLink, Field(discriminator="kind")] = Field(
+        description="serial line or TCP connection"
+    )
     address: int | Literal["none"] = Field(description="device address as shipped, for {address}")
-    outputs: dict[Name, AsciiOutput]
-    inputs: dict[Name, AsciiInput]
-    exchange: AsciiExchange | Literal["none"]
-    digital_outputs: dict[Name, AsciiDigitalOutput] = Field(default={})
-    digital_inputs: dict[Name, AsciiDigitalInput] = Field(default={})
+    outputs: dict[Name, AsciiOutput] = Field(description="outputs by name")
+    inputs: dict[Name, AsciiInput] = Field(description="inputs by name")
+    exchange: AsciiExchange | Literal["none"] = Field(
+        description="lines that write and read in one transaction; none if there are none"
+    )
+    digital_outputs: dict[Name, AsciiDigitalOutput] = Field(
+        default={}, description="digital outputs by name, for pulses at marks of the waveform"
+    )
+    digital_inputs: dict[Name, AsciiDigitalInput] = Field(
+        default={}, description="digital inputs by name, for the start of a run"
+    )
     errors: tuple[ErrorReply, ...] = Field(default=(), description="replies that report an error")
     error_query: Check | Literal["none"] = Field(
         default="none", description="query whether an earlier command has left an error"
     )
-    init: tuple[AsciiStep, ...] = ()
-    close: tuple[AsciiStep, ...] = ()
-    watchdog: AsciiWatchdog | Literal["none"]
+    init: tuple[AsciiStep, ...] = Field(
+        default=(), description="steps after the device is identified"
+    )
+    close: tuple[AsciiStep, ...] = Field(default=(), description="steps before the port is closed")
+    watchdog: AsciiWatchdog | Literal["none"] = Field(description="the device's own, or none")
     selftest: Check | Literal["none"] = Field(
         default="none", description="query that identifies the device"
     )
@@ -522,8 +485,7 @@ class AsciiProfile(BaseProfile):
 
     @model_validator(mode="after")
     def _safe_value_fits(self) -> Self:
-        steps = {} if self.watchdog == "none" else self.watchdog.model_dump()
-        for key, text in _texts(steps, _REQUESTS):
+        for key, text in _texts(self.watchdog, _REQUESTS):
             for name, output in self.outputs.items():
                 if not key.startswith("safe.") or key.startswith(f"safe.{name}."):
                     output.check_field(f"watchdog.{key}", text, "safe")
@@ -547,13 +509,13 @@ class AsciiProfile(BaseProfile):
         """See :meth:`~hilctl_drivers.profile_base.BaseProfile.misfits`."""
         rule = "must be bytes in upper-case hexadecimal with a blank between, like 0A 1F"
         if isinstance(self.link, BytesLink):
-            for key, text in _texts(self.model_dump(), {*_REQUESTS, "example"}):
+            for key, text in _texts(self, {*_REQUESTS, "example"}):
                 if not _is_bytes(text):
                     yield key, rule, repr(text)
 
     def requests(self) -> Iterator[tuple[str, str]]:
         """Yield the dotted key and the template of each request."""
-        return _texts(self.model_dump(), _REQUESTS)
+        return _texts(self, _REQUESTS)
 
     @property
     def unit(self) -> int:
@@ -575,14 +537,11 @@ _REQUESTS = {"write", "ask", "text", "high", "low"}
 """Keys of templates."""
 
 
-def _texts(data: Any, names: set[str], key: str = "") -> Iterator[tuple[str, str]]:
+def _texts(part: object, names: set[str]) -> Iterator[tuple[str, str]]:
     """Yield the dotted key and the value of each text with one of these names."""
-    items = data.items() if isinstance(data, dict) else enumerate(data)
-    for name, each in items:
-        if isinstance(each, dict | tuple):
-            yield from _texts(each, names, f"{key}{name}.")
-        elif name in names:
-            yield f"{key}{name}", each
+    for key, each in parts_of(part):
+        if isinstance(each, str) and key.rpartition(".")[2] in names:
+            yield key, each
 
 
 def _is_bytes(template: str) -> bool:

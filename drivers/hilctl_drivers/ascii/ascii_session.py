@@ -22,7 +22,6 @@ from hilctl_drivers.ascii.ascii_profile import (
     AsciiProfile,
     AsciiStep,
     AsciiTcpLink,
-    AsciiWatchdog,
     AskStep,
     BytesLink,
     Check,
@@ -450,12 +449,6 @@ def query_time(profile: AsciiProfile, query: AsciiInput) -> WireTime:
     return _lines_time(profile, [_question(profile, query)], query.settle_s)
 
 
-def digital_time(profile: AsciiProfile, output: AsciiDigitalOutput) -> WireTime:
-    """Return the time to set a digital output, with the longer line."""
-    texts = (fill(each, address=profile.unit) for each in (output.high, output.low))
-    return _lines_time(profile, [(max(texts, key=len), _example(output.reply))])
-
-
 class TextReader(SessionReader):
     """A :class:`~hilctl_drivers.dac_setup.SensorReader` for lines of text."""
 
@@ -469,26 +462,34 @@ class TextReader(SessionReader):
         """See :meth:`~hilctl_drivers.dac_setup.SensorReader.time`."""
         return query_time(profile, source).named(f"to {profile.title}")
 
-    digital_time = staticmethod(digital_time)
+    @staticmethod
+    def digital_time(profile: AsciiProfile, output: AsciiDigitalOutput) -> WireTime:
+        """Return the time to set a digital output, with the longer line."""
+        texts = (fill(each, address=profile.unit) for each in (output.high, output.low))
+        return _lines_time(profile, [(max(texts, key=len), _example(output.reply))])
 
+    @staticmethod
+    def steps_time(profile: AsciiProfile, steps: Sequence[AsciiStep]) -> WireTime:
+        """See :meth:`~hilctl_drivers.dac_setup.SessionReader.steps_time`."""
+        watchdog = profile.watchdog
+        timeout = 1 if watchdog == "none" else int(watchdog.max_s / watchdog.unit_s)
+        values = {"address": profile.unit, "timeout": timeout, "safe": 0.0}
+        lines: list[_Line] = []
+        for step in steps:
+            if isinstance(step, AskStep | NumberStep):
+                lines.append((fill(step.ask, **values), step.example))
+            elif isinstance(step, SendStep):
+                lines.append((fill(step.text, **values), _example(step.reply)))
+        waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
+        return _lines_time(profile, lines).waiting(waits_s)
 
-def feed_time(profile: AsciiProfile) -> WireTime | None:
-    """Return the time to feed the device's watchdog once; None if exchanges feed it."""
-    watchdog = profile.watchdog
-    if watchdog == "none" or watchdog.kick != "strict":
-        return None
-    return _steps_time(profile, watchdog, watchdog.feed).named("to feed the watchdog")
-
-
-def arm_s(profile: AsciiProfile, output: str) -> float:
-    """Return the longest time to arm the device's watchdog, s; 0 without a watchdog."""
-    watchdog, query = profile.watchdog, profile.error_query
-    if watchdog == "none":
-        return 0.0
-    wire = _steps_time(profile, watchdog, (*watchdog.safe.get(output, ()), *watchdog.arm))
-    if query != "none":
-        wire = wire.then(_lines_time(profile, [(query.ask, query.example)]))
-    return wire.answered_s
+    @classmethod
+    def arm_s(cls, profile: AsciiProfile, output: str) -> float:
+        """Return the time with a query of errors, see :class:`SessionReader`."""
+        query, error_s = profile.error_query, 0.0
+        if query != "none" and profile.watchdog != "none":
+            error_s = _lines_time(profile, [(query.ask, query.example)]).answered_s
+        return super().arm_s(profile, output) + error_s
 
 
 def _example(reply: Reply | Literal["none"]) -> str | None:
@@ -508,18 +509,3 @@ def _lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float =
     count = sum(_lines(text) for text, _ in lines)
     what = f"{count} {requests.NAME}{'' if count == 1 else 's'}"
     return profile.wire_time(what, sent, received, len(lines), len(replies), settle_s)
-
-
-def _steps_time(
-    profile: AsciiProfile, watchdog: AsciiWatchdog, steps: Sequence[AsciiStep]
-) -> WireTime:
-    timeout = int(watchdog.max_s / watchdog.unit_s)
-    values = {"address": profile.unit, "timeout": timeout, "safe": 0.0}
-    lines: list[_Line] = []
-    for step in steps:
-        if isinstance(step, AskStep | NumberStep):
-            lines.append((fill(step.ask, **values), step.example))
-        elif isinstance(step, SendStep):
-            lines.append((fill(step.text, **values), _example(step.reply)))
-    waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
-    return _lines_time(profile, lines).waiting(waits_s)

@@ -150,9 +150,8 @@ class BoardDac(SerialDac):
             )
         return facts
 
-    def _arm(self) -> None:
-        if self._options.watchdog != "none":
-            self._set_watchdog(self._options.watchdog_timeout_s)
+    def _arm_watchdog(self) -> None:
+        self._set_watchdog(self._options.watchdog_timeout_s)
 
     def _try_out_safe_value(self) -> None:
         """Set the output to what it holds by SAFE, or to the safe value after a trip."""

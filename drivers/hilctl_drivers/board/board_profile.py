@@ -77,30 +77,28 @@ class FrameWatchdog(Watchdog):
 
 
 class FrameProfile(BaseProfile):
-    """A board with binary frames.
-
-    Attributes:
-        link: Serial line and framing.
-        streaming: FIFO and sample clock; none if it has none.
-        outputs: The output by name.
-        inputs: The input by name; none if another device reads the sensor.
-        watchdog: Host watchdog; none if it has none.
-    """
+    """A board with binary frames."""
 
     DEVICE: ClassVar[str] = "serial_dac"
     READER: ClassVar[str] = "hilctl_drivers.board.board_dac:BoardReader"
 
-    link: FramesLink
+    link: FramesLink = Field(description="serial line and framing")
     protocol: Literal["hilctl-1", "hilctl-2"] = Field(
         description="messages, as in drivers/README.md; 2 can report the output"
     )
     exchange: Literal["single", "stream"] = Field(
         description="single: one sample per message; stream: blocks through a FIFO"
     )
-    streaming: FrameStreaming | Literal["none"] = "none"
-    outputs: dict[Name, FrameChannel] = Field(min_length=1, max_length=1)
-    inputs: dict[Name, FrameChannel] = Field(max_length=1)
-    watchdog: FrameWatchdog | Literal["none"]
+    streaming: FrameStreaming | Literal["none"] = Field(
+        default="none", description="FIFO and sample clock; none if it has none"
+    )
+    outputs: dict[Name, FrameChannel] = Field(
+        min_length=1, max_length=1, description="the output by name"
+    )
+    inputs: dict[Name, FrameChannel] = Field(
+        max_length=1, description="the input by name; none if another device reads the sensor"
+    )
+    watchdog: FrameWatchdog | Literal["none"] = Field(description="the board's own, or none")
 
     @model_validator(mode="after")
     def _consistent(self) -> Self:

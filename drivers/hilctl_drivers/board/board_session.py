@@ -1,7 +1,6 @@
 """Session with a microcontroller board: one message, one reply, fully checked."""
 
 import math
-from collections.abc import Callable
 from dataclasses import dataclass
 from struct import Struct
 from typing import Any
@@ -12,11 +11,10 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.board_profile import FrameChannel, FrameProfile
-from hilctl_drivers.transport.framing import CobsFraming, Framing, binary_framing
+from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import (
     BadRequestError,
     CorruptError,
-    IncompleteError,
     Link,
     MismatchError,
     RefusedError,
@@ -76,21 +74,6 @@ class BoardValues:
         return raw * self._channel.scale + self._channel.offset
 
 
-def _frame_missing(framing: Framing) -> Callable[[bytearray], int]:
-    """Return a function of the received bytes: how many more a reply has, at least."""
-    if isinstance(framing, CobsFraming):
-        return lambda got: 0 if 0 in got else 1
-
-    def missing(got: bytearray) -> int:
-        try:
-            framing.decode(got)
-        except IncompleteError:
-            return 1
-        return 0
-
-    return missing
-
-
 @dataclass(frozen=True, slots=True)
 class BoardFacts:
     """Reply to INFO; depth and block in samples, ``low`` and ``high`` in the output's unit."""
@@ -129,7 +112,6 @@ class BoardSession:
     def __init__(self, profile: FrameProfile, link: Link) -> None:
         framing = profile.link.framing
         self._framing = binary_framing(framing, profile.link.crc, profile.link.payload_max)
-        self._missing = _frame_missing(self._framing)
         self._seq = 0
         self.link = link
         self.outputs = BoardValues(next(iter(profile.outputs.values())))
@@ -137,7 +119,7 @@ class BoardSession:
         self.inputs = BoardValues(next(iter((profile.inputs or profile.outputs).values())))
 
     def ask(
-        self, kind: int, body: bytes = b"", reply: Struct = _NO_FIELDS
+        self, kind: int, body: bytes = b"", fields: Struct = _NO_FIELDS
     ) -> tuple[tuple[Any, ...], bytes]:
         """Send a message; return the fields of its reply, and the bytes after them.
 
@@ -146,7 +128,8 @@ class BoardSession:
             WatchdogTrippedError: The board has gone to its safe value.
             RefusedError: The board refused it; ``code`` is the status.
         """
-        payload = self._framing.decode(self.link.transact(self._frame(kind, body), self._missing))
+        reply = self.link.transact(self._frame(kind, body), self._framing.missing)
+        payload = self._framing.decode(reply)
         if payload.startswith(board.HEAD.pack(kind, self._seq)):
             raise CorruptError(
                 "the request came back before the reply: the adapter echoes, or receives what it "
@@ -163,10 +146,10 @@ class BoardSession:
         # Before the size is checked: a refusal ends at its status.
         _raise_refusal(status)
         data = payload[board.REPLY_HEAD.size :]
-        if len(data) < reply.size:
-            wanted = board.REPLY_HEAD.size + reply.size
+        if len(data) < fields.size:
+            wanted = board.REPLY_HEAD.size + fields.size
             raise MismatchError(f"reply {found_kind:02x} of {len(payload)} bytes, wanted {wanted}")
-        return reply.unpack_from(data), data[reply.size :]
+        return fields.unpack_from(data), data[fields.size :]
 
     def _frame(self, kind: int, body: bytes) -> bytes:
         self._seq = (self._seq + 1) & 0xFF
@@ -174,7 +157,7 @@ class BoardSession:
 
     def facts(self) -> BoardFacts:
         """Query the properties of the board; raise DeviceError for another protocol."""
-        fields, name = self.ask(board.INFO, reply=board.INFO_REPLY)
+        fields, name = self.ask(board.INFO, fields=board.INFO_REPLY)
         # Escaped: it goes to terminals, and a board may send anything.
         found = BoardFacts(ascii(name.decode("latin-1"))[1:-1] or "the board", *fields)
         if found.version not in board.VERSIONS:
@@ -187,7 +170,7 @@ class BoardSession:
     def state(self) -> BoardState | None:
         """Query output and input; None if the board does not know this message."""
         try:
-            (flags,), rest = self.ask(board.STATE, reply=board.STATE_REPLY)
+            (flags,), rest = self.ask(board.STATE, fields=board.STATE_REPLY)
         except RefusedError as refused:
             if refused.code != board.Status.BAD_MESSAGE:
                 raise
@@ -241,8 +224,7 @@ class BoardSession:
     def safe_frame(self, value: float) -> bytes:
         """Return the frame of :meth:`put_out`, to be sent without awaiting an answer."""
         frame = self._frame(board.SAFE, self.outputs.encode(np.array([value])))
-        # A truncated frame before it must not become one with it.
-        return b"\0" + frame if isinstance(self._framing, CobsFraming) else frame
+        return self._framing.BEFORE + frame
 
     def set_clock(self, rate_hz: float, prefill: int) -> None:
         """Empty the queue and set the sample clock, which starts with ``prefill`` samples in it.

@@ -194,8 +194,7 @@ def emulate(
         int, typer.Option(min=0, max=65535, help="The reader's own TCP port; 0 for any free port.")
     ] = EmulatorOptions.reader_port,
     unit: Annotated[
-        CommandUnit | None,
-        typer.Option(help="Unit of the drive: current or voltage; default: A."),
+        CommandUnit | None, typer.Option(help="Unit of the drive: current or voltage; default: A.")
     ] = None,
     actuator: Annotated[
         list[str] | None,

@@ -5,7 +5,7 @@ describes them: a trip of the watchdog ends the stream, and the order of queued 
 """
 
 import struct
-from collections.abc import Callable, Sequence
+from collections.abc import Callable
 
 import numpy as np
 
@@ -140,16 +140,15 @@ class LabJackStream:
         self.tick(now_ns)
         self.fifo.stop()
 
-    def read(self, address: int, count: int) -> list[int]:
+    def read(self, address: int, count: int) -> bytes:
         """Return register words; raise RejectedRequest if they are not readable, or not now."""
         _require(address in self._reads or address in self._words, _FAILURE_EXCEPTION)
         data = self._reads[address](count) if address in self._reads else self._words[address]
         _require(len(data) == 2 * count, _VALUE_EXCEPTION)
-        return list(struct.unpack(f">{count}H", data))
+        return data
 
-    def write(self, address: int, values: Sequence[int]) -> None:
+    def write(self, address: int, data: bytes) -> None:
         """Write register words; raise RejectedRequest for an address, a value or a moment."""
-        data = struct.pack(f">{len(values)}H", *values)
         if address in self._writes:
             self._writes[address](data)
             return

@@ -10,7 +10,7 @@ from hilctl_drivers.emulator.wire import RejectedRequest
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile, ModbusWatchdog
 from hilctl_drivers.modbus.register_map import EnsureStep, ModbusStep, RegisterStep, WriteStep
 
-Target = tuple[Words, list[int] | None]
+Target = tuple[Words, bytes | None]
 """A value and the words that trigger something; None stands for any words but zeros."""
 
 
@@ -87,7 +87,7 @@ def _last(steps: tuple[ModbusStep, ...], words: dict[int, Words]) -> Target | No
 def _hit(trigger: Target | None, target: Words) -> bool:
     if trigger is None or trigger[0] is not target:
         return False
-    return any(target.words) if trigger[1] is None else target.words == trigger[1]
+    return any(target.data) if trigger[1] is None else target.data == trigger[1]
 
 
 class EmulatedModbus(EmulatedDevice):
@@ -148,28 +148,28 @@ class EmulatedModbus(EmulatedDevice):
         if self._watchdog is not None:
             self._watchdog.request(self._now_ns)
 
-    def read(self, areas: Sequence[str], address: int, count: int) -> list[int]:
+    def read(self, areas: Sequence[str], address: int, count: int) -> bytes:
         """Return register words; raise RejectedRequest if not all exist."""
         if self.overlay is not None and self.overlay.has(address):
             return self.overlay.read(address, count)
         self._measure()
         return self.memory.read(areas, address, count)
 
-    def write(self, area: str, address: int, values: Sequence[int]) -> None:
+    def write(self, area: str, address: int, data: bytes) -> None:
         """Write all register words, or raise RejectedRequest and write none."""
         if self.overlay is not None and self.overlay.has(address):
-            self.overlay.write(address, values)
+            self.overlay.write(address, data)
             return
-        targets = self.memory.targets(area, address, values)
-        before = [list(words.words) for words, _ in targets]
+        targets = self.memory.targets(area, address, data)
+        before = [words.data for words, _ in targets]
         for words, wanted in targets:
-            words.words[:] = wanted
+            words.data = wanted
         try:
             for words, _ in targets:
                 self._check(words)
         except RejectedRequest:
             for (words, _), old in zip(targets, before, strict=True):
-                words.words[:] = old
+                words.data = old
             register = self.profile.error_register
             if register == "none":
                 raise
@@ -247,9 +247,9 @@ class EmulatedModbus(EmulatedDevice):
             if step.value == "safe":
                 scaled = {"scale": channel.scale, "offset": channel.offset}
                 view = Words(step.model_copy(update=scaled))
-                view.words = words.words
+                view.data = words.data
                 found = view.value
-            elif isinstance(step.value, float) and words.words != Words(step).encoded(step.value):
+            elif isinstance(step.value, float) and words.data != Words(step).encoded(step.value):
                 return None
         return found
 
@@ -265,4 +265,5 @@ class EmulatedModbus(EmulatedDevice):
             self._steps[id(digital)].value = float(self.digital_input)
         watchdog = self.profile.watchdog
         if watchdog != "none" and watchdog.tripped != "none":
-            self._steps[id(watchdog.tripped)].words[-1] = watchdog.tripped.mask * self.tripped
+            flag = watchdog.tripped
+            self._steps[id(flag)].set_bits(flag.mask, flag.mask * self.tripped)

@@ -49,23 +49,19 @@ class FeedbackPdu(ModbusPDU):
 
     async def datastore_update(self, context: Any, device_id: int) -> ModbusPDU:
         """Execute frame after frame, as LabJack's protocol page describes them."""
-        reply = b""
-        rest = self.data
-        while rest:
-            if len(rest) < 4 or rest[0] > 1:
-                return ExceptionResponse(76, ExcCodes.ILLEGAL_VALUE)
-            write, address, count = struct.unpack_from(">BHB", rest)
-            rest = rest[4:]
-            if write:
-                words = struct.unpack_from(f">{count}H", rest)
-                rest = rest[2 * count :]
-                done = await context.async_setValues(device_id, 76, address, words)
-            else:
-                done = await context.async_getValues(device_id, 76, address, count)
-                if not isinstance(done, ExcCodes):
-                    reply += struct.pack(f">{count}H", *done)
-            if isinstance(done, ExcCodes):
-                return ExceptionResponse(76, done)
+        reply, rest = b"", self.data
+        try:
+            while rest:
+                write, address, count = struct.unpack_from(">BHB", rest)
+                data, rest = rest[4 : 4 + 2 * count * write], rest[4 + 2 * count * write :]
+                if write > 1 or len(data) < 2 * count * write:
+                    return ExceptionResponse(76, ExcCodes.ILLEGAL_VALUE)
+                if write:
+                    context.device.write("holding", address, data)
+                else:
+                    reply += context.device.read(_AREAS[76], address, count)
+        except RejectedRequest as rejected:
+            return ExceptionResponse(76, ExcCodes(rejected.code))
         return FeedbackPdu(reply)
 
 
@@ -73,7 +69,7 @@ class _Context:
     """A device's registers for pymodbus's messages."""
 
     def __init__(self, device: EmulatedModbus) -> None:
-        self._device = device
+        self.device = device
 
     async def async_getValues(  # noqa: N802  pymodbus calls it by this name
         self, device_id: int, function: int, address: int, count: int
@@ -81,17 +77,19 @@ class _Context:
         try:
             if function in {5, 6}:  # read back for the echo
                 area = "coil" if function == 5 else "holding"
-                return self._device.memory.written(area, address, count)
-            return self._device.read(_AREAS[function], address, count)
+                data = self.device.memory.written(area, address, count)
+            else:
+                data = self.device.read(_AREAS[function], address, count)
         except RejectedRequest as rejected:
             return ExcCodes(rejected.code)
+        return list(struct.unpack(f">{count}H", data))
 
     async def async_setValues(  # noqa: N802  pymodbus calls it by this name
         self, device_id: int, function: int, address: int, values: Sequence[int]
     ) -> ExcCodes | None:
         area = "coil" if function in {5, 15} else "holding"
         try:
-            self._device.write(area, address, [int(value) for value in values])
+            self.device.write(area, address, struct.pack(f">{len(values)}H", *values))
         except RejectedRequest as rejected:
             return ExcCodes(rejected.code)
         return None

@@ -1,6 +1,5 @@
 """Registers of an emulated Modbus device: addresses, contents, and access."""
 
-import struct
 from collections.abc import Sequence
 from typing import TypeAlias
 
@@ -19,36 +18,30 @@ _NO_SUCH_ADDRESS = 2
 
 
 class Words:
-    """The words of one value, shared by all addresses that show it."""
+    """The words of one value, shared by all addresses that show it; a bit is a word of 0 or 1."""
 
     def __init__(self, register: Register) -> None:
         self.register = register
         self._format = None if register.type == "bit" else register.format
-        self.words = [0] * register.words
+        self.data = bytes(2 * register.words)
 
-    def encoded(self, value: float) -> list[int]:
-        """Return the words that stand for ``value``."""
-        if self._format is None:
-            return [int(value != 0.0)]
-        data = self._format.encode(value)
-        return list(struct.unpack(f">{len(data) // 2}H", data))
+    def encoded(self, value: float) -> bytes:
+        """Return the words that stand for ``value``, as bytes."""
+        return bytes((0, value != 0.0)) if self._format is None else self._format.encode(value)
 
     def set_bits(self, mask: int, bits: int) -> None:
         """Replace the bits of a mask."""
-        for k in range(len(self.words)):
-            shift = 16 * (len(self.words) - 1 - k)
-            self.words[k] = (self.words[k] & ~(mask >> shift) | bits >> shift) & 0xFFFF
+        raw = int.from_bytes(self.data, "big") & ~mask | bits
+        self.data = raw.to_bytes(len(self.data), "big")
 
     @property
     def value(self) -> float:
         """The value that the words stand for."""
-        if self._format is None:
-            return float(self.words[0])
-        return self._format.decode(struct.pack(f">{len(self.words)}H", *self.words))
+        return float(self.data[1]) if self._format is None else self._format.decode(self.data)
 
     @value.setter
     def value(self, value: float) -> None:
-        self.words[:] = self.encoded(value)
+        self.data = self.encoded(value)
 
 
 _Map: TypeAlias = dict[tuple[str, int], tuple[Words, int]]
@@ -79,29 +72,26 @@ class RegisterMap:
         self.steps: dict[int, Words] = {}
         self._place_rest()
 
-    def read(self, areas: Sequence[str], address: int, count: int) -> list[int]:
+    def read(self, areas: Sequence[str], address: int, count: int) -> bytes:
         """Return words as they are read, each from the first area that has it."""
         found = (_find(self._readable, areas, address + k) for k in range(count))
-        return [words.words[k] for words, k in found]
+        return b"".join(words.data[2 * k : 2 * k + 2] for words, k in found)
 
-    def written(self, area: str, address: int, count: int) -> list[int]:
+    def written(self, area: str, address: int, count: int) -> bytes:
         """Return words as they were last written."""
         found = (_find(self._writable, [area], address + k) for k in range(count))
-        return [words.words[k] for words, k in found]
+        return b"".join(words.data[2 * k : 2 * k + 2] for words, k in found)
 
-    def targets(
-        self, area: str, address: int, values: Sequence[int]
-    ) -> list[tuple[Words, list[int]]]:
+    def targets(self, area: str, address: int, data: bytes) -> list[tuple[Words, bytes]]:
         """Return which values a write would change, and to which words; no part of a value."""
-        found: list[tuple[Words, list[int]]] = []
-        position = 0
-        while position < len(values):
-            words, k = _find(self._writable, [area], address + position)
-            size = len(words.words)
-            if k or position + size > len(values):
+        found: list[tuple[Words, bytes]] = []
+        while data:
+            words, k = _find(self._writable, [area], address)
+            size = len(words.data)
+            if k or size > len(data):
                 raise RejectedRequest(_NO_SUCH_ADDRESS)
-            found.append((words, list(values[position : position + size])))
-            position += size
+            found.append((words, data[:size]))
+            address, data = address + size // 2, data[size:]
         return found
 
     def _share(
@@ -112,7 +102,7 @@ class RegisterMap:
         there = next((each[area, address] for each in maps if (area, address) in each), None)
         found = words if there is None else there[0]
         for each in maps:
-            for k in range(len(found.words)):
+            for k in range(len(found.data) // 2):
                 each.setdefault((area, address + k), (found, k))
         return found
 
@@ -146,7 +136,7 @@ class RegisterMap:
             if isinstance(register, RegisterStep):
                 words = self._place(register, write=not isinstance(register, ExpectStep))
                 if isinstance(register, ExpectStep) and isinstance(register.value, float):
-                    words.words[:] = Words(register).encoded(register.value)
+                    words.data = Words(register).encoded(register.value)
             elif isinstance(register, ModbusSelftest):
                 words = self._place(register, write=False)
                 words.value = register.expect

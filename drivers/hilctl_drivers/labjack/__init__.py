@@ -1,1 +1,1 @@
-"""LabJack T-series: feedback messages (function 76), and streaming from the device's buffer."""
+"""LabJack T-series: streaming from the device's buffer."""

@@ -19,17 +19,11 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.device import check_fifo, check_next
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.stream import (
-    ENABLE,
-    VALUES_MAX,
-    InputCalibration,
-    ModbusFeedback,
-    f32,
-    u32,
-)
+from hilctl_drivers.labjack.stream import ENABLE, VALUES_MAX, InputCalibration, f32, u32
 from hilctl_drivers.modbus.modbus_device import ModbusDevice
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusInput, ModbusProfile
-from hilctl_drivers.modbus.pdu import FeedbackFrame, ReadFrame, WriteFrame
+from hilctl_drivers.modbus.modbus_session import ModbusSession
+from hilctl_drivers.modbus.pdu import read_frame, write_frame
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks
 from hilctl_drivers.transport.links import Link, RefusedError
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
@@ -51,14 +45,14 @@ class StreamSession:
 
     def __init__(
         self,
-        feedback: ModbusFeedback,
+        session: ModbusSession,
         streaming: LabJackStreaming,
         timeout_s: float,
         turnaround_s: float,
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        self._feedback = feedback
+        self._feedback = session.feedback
         self._streaming = streaming
         self._timeout_s = timeout_s
         self._turnaround_s = turnaround_s
@@ -76,7 +70,7 @@ class StreamSession:
         form = self._streaming.calibration
         address, size = stream.calibration_span(form, self._streaming.calibration_address, channel)
         self._write((stream.FLASH_READ_POINTER, u32(address)))
-        data = self._feedback.read(stream.FLASH_READ, size // 2)
+        data = self._read(stream.FLASH_READ, size // 2)
         return stream.InputCalibration.decode(form, data)
 
     def stop(self) -> None:
@@ -110,7 +104,7 @@ class StreamSession:
             (stream.NUM_SCANS, u32(0)),
             (stream.SCANLIST_ADDRESS, b"".join(map(u32, (*sources, stream.STREAM_OUT0)))),
         )
-        real_hz = float(np.frombuffer(self._feedback.read(stream.SCANRATE_HZ, 2), ">f4")[0])
+        real_hz = float(np.frombuffer(self._read(stream.SCANRATE_HZ, 2), ">f4")[0])
         if not math.isclose(real_hz, rate_hz, rel_tol=_RATE_TOLERANCE):
             raise DeviceError(f"scan rate was set to {rate_hz:g} Hz, the device makes {real_hz:g}")
         self._inputs = len(sources)
@@ -145,9 +139,9 @@ class StreamSession:
             part = values[first : first + stream.VALUES_MAX]
             frames = stream.value_frames(part)
             if self.running:
-                self._exchange(frames)
+                self._exchange(*frames)
             else:
-                self._feedback.call(frames)
+                self._feedback(*frames)
             self._queued += part.size
 
     def take(self, count: int) -> npt.NDArray[np.uint16]:
@@ -160,7 +154,7 @@ class StreamSession:
             wanted = min(count - self._waiting, stream.SAMPLES_MAX)
             if wanted > self._backlog:
                 self._sleep((wanted - self._backlog) / rate_hz)
-            self._exchange(())
+            self._exchange()
             # A device that still has readings is in time: the host has stalled.
             if self._waiting < count and not self._backlog and self._clock() > deadline:
                 late = f"{self._waiting} of {count} readings within {self._timeout_s:g} s"
@@ -170,15 +164,14 @@ class StreamSession:
         self._waiting -= count
         return readings[:count]
 
-    def _exchange(self, frames: Sequence[FeedbackFrame]) -> None:
+    def _exchange(self, *frames: bytes) -> None:
         """Fetch and check readings, and write."""
-        data, free = self._feedback.call([*stream.READ_FRAMES, *frames])
-        found = stream.stream_data(data, free)
-        self._parts.append(found.raw)
-        self._waiting += found.raw.size
-        self._fetched += found.raw.size
-        self._backlog = found.backlog
-        self._check_level(self.capacity - found.free)
+        data, free = self._feedback(*stream.READ_FRAMES, *frames)
+        raw, self._backlog, room = stream.stream_data(data, free)
+        self._parts.append(raw)
+        self._waiting += raw.size
+        self._fetched += raw.size
+        self._check_level(self.capacity - room)
 
     def _check_level(self, held: int) -> None:
         """Raise if the output's buffer ran dry, or holds another number of values than expected."""
@@ -194,10 +187,13 @@ class StreamSession:
             )
 
     def _read_u32(self, address: int) -> int:
-        return int.from_bytes(self._feedback.read(address, 2), "big")
+        return int.from_bytes(self._read(address, 2), "big")
+
+    def _read(self, address: int, words: int) -> bytes:
+        return self._feedback(read_frame(address, words))[0]
 
     def _write(self, *registers: tuple[int, bytes]) -> None:
-        self._feedback.call([WriteFrame(address, data) for address, data in registers])
+        self._feedback(*(write_frame(address, data) for address, data in registers))
 
 
 def _shortage(level: int) -> str:
@@ -272,11 +268,6 @@ class ModbusStream(ModbusDevice):
         self.fifo_depth = streaming.fifo_depth
         self.block_max = max(1, streaming.fifo_depth // (options.fifo_blocks + 1))
 
-    @property
-    def stream(self) -> StreamSession | None:
-        """The stream while it is open, for tests and diagnosis."""
-        return self._stream
-
     def _longest_block(self) -> tuple[int, str]:
         why = f": fifo_blocks + 1 of them must fit into the FIFO, {self.fifo_depth} samples"
         return self.block_max, why
@@ -302,7 +293,7 @@ class ModbusStream(ModbusDevice):
         writer = self._writer
         self._end_trip()  # a device that has tripped refuses the steps that follow
         stream = StreamSession(
-            ModbusFeedback(self._link, writer.unit),
+            writer,
             streaming,
             self._options.timeout_s,
             profile.turnaround_s,
@@ -355,19 +346,18 @@ class ModbusStream(ModbusDevice):
         return [each.volts(scans[:, k]) for k, each in enumerate(self._calibrations)]
 
     def _write(self, data: bytes) -> None:
-        feedback = ModbusFeedback(self._link, self._writer.unit)
-        write = WriteFrame(self._profile.wire_address(self._target), data)
+        feedback = self._writer.feedback
+        write = write_frame(self._profile.wire_address(self._target), data)
         # The stream first: it would write over the safe value with its next scan.
         try:
-            feedback.call([WriteFrame(ENABLE, u32(0)), write])
+            feedback(write_frame(ENABLE, u32(0)), write)
         except RefusedError:  # a stream that does not run can't be stopped
-            feedback.call([write])
+            feedback(write)
 
     def _read_back(self) -> float:
         output = self._target
-        target = ReadFrame(self._profile.wire_address(output), output.words)
-        frames = [ReadFrame(ENABLE, 2), target]
-        running, held = ModbusFeedback(self._link, self._writer.unit).call(frames)
+        target = read_frame(self._profile.wire_address(output), output.words)
+        running, held = self._writer.feedback(read_frame(ENABLE, 2), target)
         if running != u32(0):
             raise DeviceError("the stream was stopped, but still runs")
         return output.format.decode(held)

@@ -1,4 +1,4 @@
-"""LabJack's Modbus Feedback, and the registers and messages of a T4's or T7's stream.
+"""Registers and messages of a LabJack T4's or T7's stream.
 
 The stream is read in command-response mode (ljm_constants.json; T-Series Datasheet 3.2.3
 Stream-Out, 3.2.4 Low-Level Stream, 20.0.0 and 20.0.1 calibration constants). A scan reads the input
@@ -10,7 +10,6 @@ status, and its argument. Then follow the samples of 16 bits, and padding up to 
 """
 
 import struct
-from collections.abc import Sequence
 from dataclasses import dataclass
 from typing import Final, Literal
 
@@ -20,49 +19,8 @@ import numpy.typing as npt
 from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
 from hilctl_drivers.modbus.modbus_profile import BYTES_A_SAMPLE
-from hilctl_drivers.modbus.pdu import (
-    FRAME_HEAD,
-    PDU_MAX,
-    TCP_HEAD,
-    FeedbackFrame,
-    ReadFrame,
-    WriteFrame,
-    feedback_pdu,
-    reply_data,
-    tcp_adu,
-    tcp_missing,
-    tcp_pdu,
-)
-from hilctl_drivers.transport.links import Link, MismatchError
-
-
-class ModbusFeedback:
-    """Requests with function 76 to a T-series device."""
-
-    def __init__(self, link: Link, unit: int) -> None:
-        self._link = link
-        self._unit = unit
-        self._transaction = 0
-
-    def call(self, frames: Sequence[FeedbackFrame]) -> list[bytes]:
-        """Execute frames in one message; return the bytes of each read frame.
-
-        Raises:
-            DeviceError: No answer, not a good one, or a refusal of a frame; those before it may
-                have been executed.
-        """
-        self._transaction = transaction = (self._transaction + 1) & 0xFFFF
-        sizes = [frame.reply_size for frame in frames if frame.reply_size]
-        pdu = feedback_pdu(*frames)
-        request = tcp_adu(transaction, self._unit, pdu)
-        reply = self._link.transact(request, tcp_missing, TCP_HEAD + 1 + sum(sizes))
-        data = reply_data(pdu, tcp_pdu(reply, transaction, self._unit))
-        return list(struct.unpack("".join(f"{size}s" for size in sizes), data))
-
-    def read(self, address: int, words: int) -> bytes:
-        """Return the bytes of registers."""
-        return self.call([ReadFrame(address, words)])[0]
-
+from hilctl_drivers.modbus.pdu import FRAME_HEAD, PDU_MAX, read_frame, write_frame
+from hilctl_drivers.transport.links import MismatchError
 
 SCANRATE_HZ: Final = 4002
 NUM_ADDRESSES: Final = 4004
@@ -118,36 +76,26 @@ f32 = struct.Struct(">f").pack
 """Register bytes of a number."""
 
 
-READ_FRAMES: Final[tuple[FeedbackFrame, ...]] = (
-    ReadFrame(DATA_CR, DATA_HEAD.size // 2 + SAMPLES_MAX),
-    ReadFrame(OUT_BUFFER_STATUS, _U32_WORDS),
+READ_FRAMES: Final = (
+    read_frame(DATA_CR, DATA_HEAD.size // 2 + SAMPLES_MAX),
+    read_frame(OUT_BUFFER_STATUS, _U32_WORDS),
 )
 """First frames of each message of a run: the state before its own values."""
 
 
-def value_frames(values: F64) -> tuple[FeedbackFrame, ...]:
+def value_frames(values: F64) -> tuple[bytes, bytes]:
     """Return the frames that queue float64[n] values, n at most :data:`VALUES_MAX`."""
     data = values.astype(">f4").tobytes()
-    return WriteFrame(OUT_BUFFER_F32, data), WriteFrame(OUT_SET_LOOP, u32(USE_AT_ONCE))
+    return write_frame(OUT_BUFFER_F32, data), write_frame(OUT_SET_LOOP, u32(USE_AT_ONCE))
 
 
-@dataclass(frozen=True, slots=True)
-class StreamData:
-    """Readings in a message, and the state of both buffers.
+def stream_data(data: bytes, free: bytes) -> tuple[npt.NDArray[np.uint16], int, int]:
+    """Return the content of the answers to :data:`READ_FRAMES`, or raise if scans were lost.
 
-    Attributes:
-        raw: uint16[n], readings of the oldest scans.
-        backlog: Scans left in the device.
-        free: Values that still fit into the output's buffer.
+    Returns:
+        uint16[n], readings of the oldest scans; scans left in the device; values that still fit
+        into the output's buffer.
     """
-
-    raw: npt.NDArray[np.uint16]
-    backlog: int
-    free: int
-
-
-def stream_data(data: bytes, free: bytes) -> StreamData:
-    """Return the content of the answers to :data:`READ_FRAMES`, or raise if scans were lost."""
     count, backlog_bytes, status, more = DATA_HEAD.unpack_from(data)
     if status:
         text = STATUS.get(status, "stream status {}")
@@ -157,25 +105,18 @@ def stream_data(data: bytes, free: bytes) -> StreamData:
     raw = np.frombuffer(data, ">u2", count, DATA_HEAD.size).astype(np.uint16)
     if (raw == MISSING).any():
         raise DeviceError("scans are missing from the stream")
-    return StreamData(raw, backlog_bytes // BYTES_A_SAMPLE, int.from_bytes(free, "big"))
+    return raw, backlog_bytes // BYTES_A_SAMPLE, int.from_bytes(free, "big")
 
 
 @dataclass(frozen=True, slots=True)
 class InputCalibration:
-    """Conversion of raw readings of one input to volts.
+    """Conversion of raw readings of one input to volts."""
 
-    Attributes:
-        center: Raw reading at ``offset_v``.
-        positive_v: Volts of a step above it.
-        negative_v: Volts of a step below it, with its sign: readings below are
-            ``(center - raw) * negative_v``.
-        offset_v: Volts at the centre.
-    """
-
-    center: float
-    positive_v: float
+    center: float  # raw reading at ``offset_v``
+    positive_v: float  # volts of a step above it
+    # Volts of a step below it, with its sign: readings below are ``(center - raw) * negative_v``.
     negative_v: float
-    offset_v: float = 0.0
+    offset_v: float = 0.0  # volts at the centre
 
     @classmethod
     def decode(cls, form: Literal["two_slopes", "line"], data: bytes) -> "InputCalibration":

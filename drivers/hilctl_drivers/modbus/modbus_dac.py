@@ -15,12 +15,7 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.types import F64
 from hilctl_drivers.modbus.modbus_device import ModbusDevice
 from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusProfile
-from hilctl_drivers.modbus.modbus_session import (
-    combined_request,
-    feed_time,
-    read_requests,
-    write_request,
-)
+from hilctl_drivers.modbus.modbus_session import combined_request, read_requests, write_request
 from hilctl_drivers.signal_chain import DacOptions, Measure
 from hilctl_drivers.transport.links import NoAnswerError, RefusedError
 from hilctl_drivers.transport.wire_time import RateLimit
@@ -51,19 +46,13 @@ class ModbusDac(ModbusDevice):
         self._factors = self._chain.factors
         self._encode = self._target.format.encode
         self._swap: Swap = _not_open
-        self._measure: Callable[[], float] | None = None
-        if self._setup.measure is not None:
-            self._measured_by = self._chain.measured(self._setup.measure)
         self.one_transaction = self._may_combine
         """Whether a tick is one transaction, as far as is known; opening it shows."""
 
     def _rates(self, block: int) -> RateLimit:
         """Return the rates with the present number of transactions."""
         del block
-        wire = self._wire(self.one_transaction)
-        if self._options.watchdog != "none":
-            wire = wire.then(feed_time(self._profile))
-        return self._setup.rates(wire)
+        return self._setup.rates(self._wire(self.one_transaction).then(self._feed_time()))
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Self-test, init steps, one reading of the input; see :class:`DacDevice`.
@@ -84,8 +73,6 @@ class ModbusDac(ModbusDevice):
         how = "one transaction" if self.one_transaction else "a read and a write"
         replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
         self._swap = self._checked(swap)
-        if self._setup.measure is not None:
-            self._measure = writer.input_reader(self._setup.measure)
         self.transactions = self._transactions()
 
     def _transactions(self) -> int:
@@ -104,9 +91,7 @@ class ModbusDac(ModbusDevice):
         gain, offset, um_per_unit, offset_um = self._factors
         request = self._encode((command.item() - offset) / gain)
         displacement_um[0] = self._swap(request) * um_per_unit + offset_um
-        if self._measure is not None:
-            gain, offset = self._measured_by
-            measured[0] = self._measure() * gain + offset
+        self._measure_output(measured)
         if self._feed_every:
             self._feed()
 

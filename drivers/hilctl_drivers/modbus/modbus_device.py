@@ -2,18 +2,15 @@
 
 from collections.abc import Callable
 from contextlib import suppress
-from typing import cast
 
 import numpy as np
 
 from hilctl.base.errors import DeviceError, InputError, UnconfirmedError
-from hilctl_drivers.dac_setup import SensorReader
 from hilctl_drivers.modbus.modbus_profile import ModbusOutput, ModbusProfile, ModbusWatchdog
 from hilctl_drivers.modbus.modbus_session import (
-    arm_s,
+    ModbusSession,
     exchange_time,
     read_time,
-    session_at,
     write_request,
 )
 from hilctl_drivers.modbus.register_map import ModbusStep, RegisterStep
@@ -22,13 +19,15 @@ from hilctl_drivers.transport.links import Link, RefusedError
 from hilctl_drivers.transport.safe_exchange import check_read_back, try_out
 from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.wire_time import WireTime
-from hilctl_drivers.wired_dac import WiredDac
+from hilctl_drivers.wired_dac import SteppedDac
 
 
-class ModbusDevice(WiredDac):
+class ModbusDevice(SteppedDac):
     """Session, watchdog and safe value of ``modbus_dac`` and ``modbus_stream``."""
 
-    _reader: SensorReader
+    _profile: ModbusProfile
+    _target: ModbusOutput
+    _writer: ModbusSession
 
     def __init__(self, options: DacOptions, link: Link | None = None) -> None:
         """See :class:`~hilctl_drivers.wired_dac.WiredDac`."""
@@ -39,13 +38,8 @@ class ModbusDevice(WiredDac):
         super().__init__(options, link)
 
     def _prepare(self) -> None:
-        setup, options = self._setup, self._options
-        self._profile = cast(ModbusProfile, setup.writer.profile)
-        self._target = cast(ModbusOutput, setup.output)
-        self._writer = session_at(setup.writer, self._link)
-        self._reader = setup.reader_on(self._link)
-        self.measures = setup.measure is not None
-        self.arm_s = arm_s(self._profile, options.output)
+        super()._prepare()
+        setup = self._setup
         readback = self._target.readback_register
         if readback is None and self._target.function == 6 and setup.writer.framing == "rtu":
             # The correct reply equals the request, and is what a line that echoes gives.
@@ -69,25 +63,17 @@ class ModbusDevice(WiredDac):
             wire = wire.then(read_time(profile, setup.measure).named("to measure the output"))
         return setup.after_reading(wire)
 
-    def _connect(self) -> None:
-        """Connect and check that the devices are the right ones."""
-        self._link.open()
-        self._writer.check_selftest()
-        self._reader.open()
-
-    def _arm(self) -> None:
+    def _arm_watchdog(self) -> None:
         has = self._profile.watchdog
-        if self._options.watchdog == "none" or has == "none":
+        if has == "none":
             return
-        # The safe value before the timeout: once it counts, it must know where to go.
-        steps = self._bound((*has.safe.get(self._options.output, ()), *has.arm))
+        steps = self._bound(has.arming(self._options.output))
         if self._writer.would_change(steps):
             self._writer.run(self._bound(has.unlock))
         self._writer.run(steps)
 
-    def _run_feed_steps(self) -> None:
-        has = self._profile.watchdog
-        self._writer.run(() if has == "none" else self._bound(has.feed))
+    def _run(self, name: str) -> None:
+        self._writer.run(self._bound(getattr(self._profile.watchdog, name, ())))
 
     def _bound(self, steps: tuple[ModbusStep, ...]) -> tuple[ModbusStep, ...]:
         """Return steps with the experiment's timeout and safe value in them; none without one."""
@@ -211,10 +197,3 @@ class ModbusDevice(WiredDac):
     def _read_back(self) -> float | None:
         """Return the value of the output after a safe value; None if it cannot be known."""
         return self._held()
-
-    def _close(self) -> None:
-        # First: nothing feeds it any more, and it would trip while the close steps run.
-        has = self._profile.watchdog
-        self._writer.run(() if has == "none" else self._bound(has.disarm))
-        self._writer.run(self._writer.profile.close)
-        self._reader.end()

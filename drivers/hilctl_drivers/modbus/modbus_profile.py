@@ -2,7 +2,7 @@
 
 from collections.abc import Iterator
 from itertools import combinations
-from typing import Annotated, Any, ClassVar, Literal, Self
+from typing import Annotated, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -24,8 +24,9 @@ from hilctl_drivers.profile_base import (
     BinaryLineSettings,
     LinkSettings,
     Name,
+    SteppedWatchdog,
     StreamSettings,
-    Watchdog,
+    parts_of,
 )
 
 BYTES_A_SAMPLE = 2
@@ -167,24 +168,13 @@ class ModbusInput(Channel):
         return self
 
 
-class ModbusWatchdog(Watchdog):
+class ModbusWatchdog(SteppedWatchdog[ModbusStep]):
     """A host watchdog set and read through registers."""
 
-    arm: tuple[ModbusStep, ...] = Field(
-        min_length=1, description="steps that set and start the watchdog"
-    )
     unlock: tuple[ModbusStep, ...] = Field(
         default=(),
         description="steps before safe and arm, run only if an ensure step in those has a register"
         " to change",
-    )
-    disarm: tuple[ModbusStep, ...] = Field(default=(), description="steps that stop the watchdog")
-    feed: tuple[ModbusStep, ...] = Field(
-        default=(), description="steps that feed a strict watchdog"
-    )
-    clear: tuple[ModbusStep, ...] = Field(default=(), description="steps that clear a trip")
-    safe: dict[Name, tuple[ModbusStep, ...]] = Field(
-        default={}, description="steps that set the safe value, per output"
     )
     tripped: StatusRegister | Literal["none"] = Field(
         default="none", description="register that shows a trip"
@@ -315,7 +305,7 @@ class ModbusProfile(BaseProfile):
 
     def registers(self) -> Iterator[tuple[str, Register]]:
         """Yield every register with its dotted key."""
-        return _registers(self)
+        return ((key, each) for key, each in parts_of(self) if isinstance(each, Register))
 
     def span(self, register: Register) -> tuple[int, int]:
         """Return wire address and number of the registers that are read for one.
@@ -337,18 +327,3 @@ class ModbusProfile(BaseProfile):
         """Return the address that goes into the frame, 0 to 65535."""
         base = self.address_base if register.address_base is None else register.address_base
         return wire_address(register, base)
-
-
-def _registers(part: object, key: str = "") -> Iterator[tuple[str, Register]]:
-    """Yield every register in a part of a profile."""
-    if isinstance(part, Register):
-        yield key, part
-    parts: dict[Any, object] = {}
-    if isinstance(part, StrictModel):
-        parts = {name: getattr(part, name) for name in type(part).model_fields}
-    elif isinstance(part, dict):
-        parts = part
-    elif isinstance(part, tuple):
-        parts = dict(enumerate(part))
-    for name, each in parts.items():
-        yield from _registers(each, f"{key}.{name}" if key else name)

@@ -8,38 +8,14 @@ parsed by :mod:`hilctl_drivers.modbus.pdu`, which raises the error.
 import math
 import struct
 import time
-from abc import ABC, abstractmethod
 from collections.abc import Callable, Sequence
-from typing import Literal, cast
+from typing import Literal, TypeAlias, cast
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.dac_setup import SessionReader
 from hilctl_drivers.endpoint import Endpoint
+from hilctl_drivers.modbus import pdu as modbus
 from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusOutput, ModbusProfile
-from hilctl_drivers.modbus.pdu import (
-    FEEDBACK,
-    TCP_HEAD,
-    WRITE_COIL,
-    WRITE_READ,
-    WRITE_REGISTER,
-    WRITE_REGISTERS,
-    ReadFrame,
-    WriteFrame,
-    coil_pdu,
-    feedback_pdu,
-    read_pdu,
-    reply_data,
-    reply_layout,
-    reply_size,
-    rtu_adu,
-    rtu_pdu,
-    tcp_adu,
-    tcp_missing,
-    tcp_pdu,
-    write_pdu,
-    write_read_pdu,
-    write_single_pdu,
-)
 from hilctl_drivers.modbus.register_map import (
     DigitalRegister,
     EnsureStep,
@@ -54,52 +30,36 @@ from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
 from hilctl_drivers.transport.links import CorruptError, IncompleteError, Link, RefusedError
 from hilctl_drivers.transport.wire_time import WireTime
 
-_RTU_SHORTEST = 5
+_tcp_start = struct.Struct(">HH").unpack_from
 
 
-_DATA_AT = {WRITE_REGISTER: 3, WRITE_REGISTERS: 6, WRITE_READ: 10, FEEDBACK: 9}
-"""Start of the data to write, which are the end of the request PDU, by function."""
-
-
-class Transaction(ABC):
+class _Prepared:
     """A prepared request and the check of its reply; what is the same in all is kept."""
 
     def __init__(self, adu: bytes, pdu: bytes, start: int) -> None:
         """Take the first request, its PDU, and where in the request the PDU begins."""
         self.pdu = pdu
         """The first request; later ones differ in the data only."""
-        first = _DATA_AT.get(pdu[0], len(pdu))
-        head, read_size = reply_layout(pdu)
+        first = modbus.DATA_AT.get(pdu[0], len(pdu))
+        head, read_size = modbus.reply_layout(pdu)
         self._last = adu
         self._data = pdu[first:]
         self._data_size = len(self._data)
         self._before = adu[: start + first]
         # The reply to a single write echoes all of the request.
-        self._echo = pdu[0] == WRITE_REGISTER
+        self._echo = pdu[0] == modbus.WRITE_REGISTER
         self._head = adu[:start] + head
         self._read_size = read_size
         self.reply_size = len(self._head) + read_size
         """Bytes of a good reply."""
 
-    @abstractmethod
-    def request(self, data: bytes = b"") -> bytes:
-        """Return the next request; without ``data`` it writes those of the last call."""
 
-    @abstractmethod
-    def reply(self, adu: Bytes) -> bytes:
-        """Return the register bytes in the reply to the last request, or raise FrameError."""
-
-    @abstractmethod
-    def missing(self, received: Bytes) -> int:
-        """Return the number of missing bytes; 0 if the reply is complete."""
-
-
-class TcpTransaction(Transaction):
-    """A prepared Modbus TCP :class:`Transaction`; each request has the next transaction id."""
+class TcpTransaction(_Prepared):
+    """A prepared Modbus TCP request; each has the next transaction id."""
 
     def __init__(self, unit: int, pdu: bytes, transaction: int = 0) -> None:
         """Prepare ``pdu`` for ``unit``; the first request's id is ``transaction`` + 1."""
-        super().__init__(tcp_adu(transaction, unit, pdu), pdu, TCP_HEAD)
+        super().__init__(modbus.tcp_adu(transaction, unit, pdu), pdu, modbus.TCP_HEAD)
         self._unit = unit
         self._transaction = transaction
         self._before = self._before[2:]
@@ -109,7 +69,7 @@ class TcpTransaction(Transaction):
         self._split = struct.Struct(f">H{len(self._head)}s{self._read_size}s").unpack
 
     def request(self, data: bytes = b"") -> bytes:
-        """See :meth:`Transaction.request`."""
+        """Return the next request; without ``data`` it writes those of the last call."""
         if data:
             self._data = data
             if self._echo:
@@ -119,28 +79,34 @@ class TcpTransaction(Transaction):
         return made
 
     def reply(self, adu: Bytes) -> bytes:
-        """See :meth:`Transaction.reply`."""
+        """Return the register bytes in the reply to the last request, or raise FrameError."""
         if len(adu) == self.reply_size:
             transaction, head, read = self._split(adu)
             if transaction == self._transaction and head == self._head:
                 return cast(bytes, read)
-        pdu = tcp_pdu(adu, self._transaction, self._unit)
-        return reply_data(self._last[TCP_HEAD:], pdu)
+        pdu = modbus.tcp_pdu(adu, self._transaction, self._unit)
+        return modbus.reply_data(self._last[modbus.TCP_HEAD :], pdu)
 
     def missing(self, received: Bytes) -> int:
-        """See :meth:`Transaction.missing`."""
-        return tcp_missing(received)
+        """Return the number of missing bytes; 0 if the reply is complete, or is no Modbus TCP."""
+        count = len(received)
+        if count <= modbus.TCP_HEAD:
+            return modbus.TCP_HEAD + 1 - count
+        protocol, length = _tcp_start(received, 2)
+        if protocol or length > modbus.PDU_MAX + 1:
+            return 0
+        return max(0, int(length) + 6 - count)
 
 
-class RtuTransaction(Transaction):
-    """A prepared Modbus RTU :class:`Transaction`; there is no id to tell a late reply by.
+class RtuTransaction(_Prepared):
+    """A prepared Modbus RTU request; there is no id to tell a late reply by.
 
     CRCs of what never changes are computed once; the rest is taken two bytes at a time.
     """
 
     def __init__(self, unit: int, pdu: bytes) -> None:
         """Prepare ``pdu`` for ``unit``."""
-        super().__init__(rtu_adu(unit, pdu), pdu, 1)
+        super().__init__(modbus.rtu_adu(unit, pdu), pdu, 1)
         self._unit = unit
         self.reply_size += 2
         self._before_crc = crc16_modbus(self._before)
@@ -152,7 +118,7 @@ class RtuTransaction(Transaction):
         self._in_words = self._read_size % 2 == 0  # bits may not be
 
     def request(self, data: bytes = b"") -> bytes:
-        """See :meth:`Transaction.request`."""
+        """Return the next request; without ``data`` it writes those of the last call."""
         if not data:
             return self._last
         table, crc = MODBUS_WORDS, self._before_crc
@@ -165,7 +131,7 @@ class RtuTransaction(Transaction):
         return made
 
     def reply(self, adu: Bytes) -> bytes:
-        """See :meth:`Transaction.reply`."""
+        """Return the register bytes in the reply to the last request, or raise FrameError."""
         if len(adu) == self.reply_size and self._in_words:
             head, read, sent = self._split(adu)
             if head == self._head:
@@ -182,19 +148,22 @@ class RtuTransaction(Transaction):
         missing = self.missing(adu)
         if missing:
             raise IncompleteError(f"{missing} more bytes belong to the reply")
-        return reply_data(self._last[1:-2], rtu_pdu(adu, self._unit))
+        return modbus.reply_data(self._last[1:-2], modbus.rtu_pdu(adu, self._unit))
 
     def missing(self, received: Bytes) -> int:
-        """See :meth:`Transaction.missing`."""
+        """Return the number of missing bytes; 0 if the reply is complete."""
         count = len(received)
-        if count < _RTU_SHORTEST:
-            return _RTU_SHORTEST - count
+        if count < modbus.RTU_SHORTEST:
+            return modbus.RTU_SHORTEST - count
         return 0 if received[1] & 0x80 else max(0, self.reply_size - count)
+
+
+Transaction: TypeAlias = TcpTransaction | RtuTransaction
 
 
 def read_request(profile: ModbusProfile, register: Register) -> bytes:
     """Return the PDU that reads a register, and the validity of an input beside it."""
-    return read_pdu(register.read_function, *profile.span(register))
+    return modbus.read_pdu(register.read_function, *profile.span(register))
 
 
 def write_request(profile: ModbusProfile, register: Register, data: bytes = b"") -> bytes:
@@ -202,11 +171,11 @@ def write_request(profile: ModbusProfile, register: Register, data: bytes = b"")
     address = profile.wire_address(register)
     data = data or bytes(2 * register.words)
     if register.type == "bit":
-        return coil_pdu(address, any(data))
+        return modbus.coil_pdu(address, any(data))
     single = register.words == 1
     if isinstance(register, ModbusOutput):
         single = register.function == 6
-    return (write_single_pdu if single else write_pdu)(address, data)
+    return (modbus.write_single_pdu if single else modbus.write_pdu)(address, data)
 
 
 def combined_request(
@@ -216,9 +185,9 @@ def combined_request(
     source, target = profile.span(sensor), profile.wire_address(output)
     data = bytes(2 * output.words)
     if profile.exchange == 23:
-        return write_read_pdu(*source, target, data)
+        return modbus.write_read_pdu(*source, target, data)
     if profile.exchange == 76:
-        return feedback_pdu(ReadFrame(*source), WriteFrame(target, data))
+        return modbus.feedback_pdu(modbus.read_frame(*source), modbus.write_frame(target, data))
     return None
 
 
@@ -239,6 +208,7 @@ class ModbusSession:
         self._framing = framing
         self.unit = unit
         self._sleep = sleep
+        self._feedbacks = 0
 
     def prepare(self, pdu: bytes) -> Transaction:
         """Return a request that can be sent many times."""
@@ -254,13 +224,24 @@ class ModbusSession:
         except RefusedError as error:
             raise RefusedError(f"{error}{self._keys(transaction.pdu)}", error.code) from None
 
+    def feedback(self, *frames: bytes) -> list[bytes]:
+        """Execute frames with function 76 in one message; return the bytes of each read frame.
+
+        After a refusal of a frame, those before it may have been executed.
+        """
+        pdu = modbus.feedback_pdu(*frames)
+        transaction = TcpTransaction(self.unit, pdu, self._feedbacks)
+        self._feedbacks = (self._feedbacks + 1) & 0xFFFF
+        words = "".join(f"{size}s" for size in modbus.feedback_sizes(pdu))
+        return list(struct.unpack(words, self.call(transaction)))
+
     def _keys(self, pdu: bytes) -> str:
         """Return the keys of registers at the address of a request; none for functions 23, 76."""
         address = int.from_bytes(pdu[1:3], "big")
         keys = [
             key
             for key, register in self.profile.registers()
-            if pdu[0] in {register.read_function, WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS}
+            if pdu[0] in {register.read_function, *modbus.PLAIN_WRITES}
             and self.profile.wire_address(register) == address
         ]
         return f" ({', '.join(keys)} in the profile)" if keys else ""
@@ -439,30 +420,13 @@ def read_requests(profile: ModbusProfile, sensor: ModbusInput) -> list[bytes]:
     return requests
 
 
-def feed_time(profile: ModbusProfile) -> WireTime | None:
-    """Return the time to feed the device's watchdog once; None if exchanges feed it."""
-    watchdog = profile.watchdog
-    if watchdog == "none" or watchdog.kick != "strict":
-        return None
-    return _steps_time(profile, watchdog.feed).named("to feed the watchdog")
-
-
-def arm_s(profile: ModbusProfile, output: str) -> float:
-    """Return the longest time to arm the device's watchdog, s; 0 without a watchdog."""
-    watchdog = profile.watchdog
-    if watchdog == "none":
-        return 0.0
-    steps = (*watchdog.unlock, *watchdog.safe.get(output, ()), *watchdog.arm)
-    return _steps_time(profile, steps).answered_s
-
-
 def _requests_time(
     profile: ModbusProfile, requests: Sequence[bytes], settle_s: float = 0.0
 ) -> WireTime:
     """Return the time of request PDUs and their replies, one after the other."""
     what = "+".join(f"FC{pdu[0]:02d}" for pdu in requests)
-    sent = sum(len(rtu_adu(1, pdu)) for pdu in requests)
-    received = sum(reply_size(pdu) + 3 for pdu in requests)  # unit and CRC
+    sent = sum(len(modbus.rtu_adu(1, pdu)) for pdu in requests)
+    received = sum(modbus.reply_size(pdu) + 3 for pdu in requests)  # unit and CRC
     count = len(requests)
     return profile.wire_time(what, sent, received, 2 * count, count, settle_s)
 
@@ -479,24 +443,23 @@ def _step_requests(profile: ModbusProfile, step: ModbusStep) -> list[bytes]:
     return [write, read] if step.verify else [write]
 
 
-def _steps_time(profile: ModbusProfile, steps: Sequence[ModbusStep]) -> WireTime:
-    """Return the longest time of steps; a step that may write counts as one that does."""
-    requests = [pdu for step in steps for pdu in _step_requests(profile, step)]
-    waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
-    return _requests_time(profile, requests).waiting(waits_s)
-
-
-def session_at(endpoint: Endpoint, link: Link) -> ModbusSession:
-    """Return a session with a device, on a link that it may share with others."""
-    assert endpoint.unit is not None, "Modbus devices have an address"
-    framing: Literal["tcp", "rtu"] = "tcp" if endpoint.framing == "tcp" else "rtu"
-    profile = cast(ModbusProfile, endpoint.profile)
-    return ModbusSession(profile, link, endpoint.unit, framing=framing)
-
-
 class ModbusReader(SessionReader):
     """A :class:`~hilctl_drivers.dac_setup.SensorReader` for Modbus."""
 
-    session_on = staticmethod(session_at)
     time = staticmethod(read_time)
     digital_time = staticmethod(digital_time)
+
+    @staticmethod
+    def session_on(endpoint: Endpoint, link: Link) -> ModbusSession:
+        """See :meth:`~hilctl_drivers.dac_setup.SessionReader.session_on`."""
+        assert endpoint.unit is not None, "Modbus devices have an address"
+        framing: Literal["tcp", "rtu"] = "tcp" if endpoint.framing == "tcp" else "rtu"
+        profile = cast(ModbusProfile, endpoint.profile)
+        return ModbusSession(profile, link, endpoint.unit, framing=framing)
+
+    @staticmethod
+    def steps_time(profile: ModbusProfile, steps: Sequence[ModbusStep]) -> WireTime:
+        """See :meth:`~hilctl_drivers.dac_setup.SessionReader.steps_time`."""
+        requests = [pdu for step in steps for pdu in _step_requests(profile, step)]
+        waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
+        return _requests_time(profile, requests).waiting(waits_s)

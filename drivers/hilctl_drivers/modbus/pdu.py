@@ -9,8 +9,6 @@ Builders check nothing: a profile is validated, so its addresses, sizes and unit
 """
 
 import struct
-from dataclasses import dataclass
-from typing import ClassVar, TypeAlias
 
 from hilctl_drivers.transport.crc import Bytes, crc16_modbus
 from hilctl_drivers.transport.links import (
@@ -24,15 +22,18 @@ from hilctl_drivers.transport.links import (
 READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT = 1, 2, 3, 4
 WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS, WRITE_READ = 5, 6, 16, 23
 FEEDBACK = 76
+PLAIN_WRITES = frozenset({WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS})
+DATA_AT = {WRITE_REGISTER: 3, WRITE_REGISTERS: 6, WRITE_READ: 10, FEEDBACK: 9}
+"""Start of the data to write, which are the end of the request PDU, by function."""
 
 PDU_MAX = 253
+RTU_SHORTEST = 5
+"""Bytes of the shortest RTU reply."""
 TCP_HEAD = 7
 """Bytes of the MBAP header, unit included."""
-_TCP_SHORTEST = TCP_HEAD + 1
 FRAME_HEAD = 4
 """Bytes of a feedback frame before its data."""
 _frame_head = struct.Struct(">BHB").pack
-_tcp_start = struct.Struct(">HHH").unpack_from
 
 EXCEPTIONS = {
     1: "illegal function", 2: "illegal data address", 3: "illegal data value",
@@ -68,46 +69,25 @@ def write_read_pdu(read_address: int, read_count: int, write_address: int, data:
     return struct.pack(">BHHHHB", *head) + data
 
 
-@dataclass(frozen=True, slots=True)
-class ReadFrame:
-    """Read ``words`` registers from ``address`` on."""
-
-    address: int
-    words: int
-
-    def encode(self) -> bytes:
-        """Return the frame's bytes."""
-        return _frame_head(0, self.address, self.words)
-
-    @property
-    def reply_size(self) -> int:
-        """Bytes of the reply to this frame."""
-        return 2 * self.words
+def read_frame(address: int, words: int) -> bytes:
+    """Return the frame that reads registers from ``address`` on: ``00 address16 words8``."""
+    return _frame_head(0, address, words)
 
 
-@dataclass(frozen=True, slots=True)
-class WriteFrame:
-    """Write register bytes from ``address`` on; a buffer register takes all."""
+def write_frame(address: int, data: bytes) -> bytes:
+    """Return the frame that writes registers: ``01 address16 words8 data``.
 
-    address: int
-    data: bytes
-    reply_size: ClassVar[int] = 0
-
-    def encode(self) -> bytes:
-        """Return the frame's bytes."""
-        return _frame_head(1, self.address, len(self.data) // 2) + self.data
+    A buffer register takes all.
+    """
+    return _frame_head(1, address, len(data) // 2) + data
 
 
-FeedbackFrame: TypeAlias = ReadFrame | WriteFrame
-
-
-def feedback_pdu(*frames: FeedbackFrame) -> bytes:
+def feedback_pdu(*frames: bytes) -> bytes:
     """Return a LabJack Modbus Feedback request (76), which executes frames in their order.
 
-    A frame is ``00 address16 words8`` to read and ``01 address16 words8 data`` to write. A reply
-    has the words of each read.
+    A reply has the words of each read.
     """
-    return bytes((FEEDBACK,)) + b"".join(frame.encode() for frame in frames)
+    return bytes((FEEDBACK,)) + b"".join(frames)
 
 
 def reply_layout(pdu: bytes) -> tuple[bytes, int]:
@@ -117,22 +97,24 @@ def reply_layout(pdu: bytes) -> tuple[bytes, int]:
         size = (int.from_bytes(pdu[3:5], "big") + 7) // 8
     elif function in {READ_HOLDING, READ_INPUT, WRITE_READ}:
         size = 2 * int.from_bytes(pdu[3:5], "big")
-    elif function in {WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS}:
+    elif function in PLAIN_WRITES:
         return pdu[:5], 0
     else:
-        return pdu[:1], _feedback_reads(pdu)
+        return pdu[:1], sum(feedback_sizes(pdu))
     return bytes((function, size)), size
 
 
-def _feedback_reads(pdu: bytes) -> int:
-    """Return the number of bytes that a Modbus Feedback request reads."""
-    size, at = 0, 1
+def feedback_sizes(pdu: bytes) -> list[int]:
+    """Return the number of bytes that each read frame of a Modbus Feedback request reads."""
+    sizes, at = [], 1
     while at < len(pdu):
-        words = 2 * pdu[at + 3]
-        write = pdu[at]
-        size += 0 if write else words
-        at += 4 + words * write
-    return size
+        size = 2 * pdu[at + 3]
+        if pdu[at]:
+            at += size
+        else:
+            sizes.append(size)
+        at += FRAME_HEAD
+    return sizes
 
 
 def reply_size(pdu: bytes) -> int:
@@ -205,17 +187,6 @@ def tcp_pdu(adu: Bytes, transaction: int, unit: int) -> bytes:
     return bytes(adu[TCP_HEAD:])
 
 
-def tcp_missing(received: Bytes) -> int:
-    """Return the number of missing bytes; 0 if the message is complete, or is no Modbus TCP."""
-    count = len(received)
-    if count < _TCP_SHORTEST:
-        return _TCP_SHORTEST - count
-    _, protocol, length = _tcp_start(received)
-    if protocol or length > PDU_MAX + 1:
-        return 0
-    return max(0, int(length) + 6 - count)
-
-
 def rtu_adu(unit: int, pdu: bytes) -> bytes:
     """Return ``pdu`` with CRC, for a unit from 1 to 255.
 
@@ -236,8 +207,8 @@ def rtu_pdu(adu: Bytes, unit: int) -> bytes:
         CorruptError: The CRC is wrong.
         MismatchError: Another unit.
     """
-    if len(adu) < 5:
-        raise IncompleteError(f"{len(adu)} of at least 5 bytes")
+    if len(adu) < RTU_SHORTEST:
+        raise IncompleteError(f"{len(adu)} of at least {RTU_SHORTEST} bytes")
     if crc16_modbus(adu):
         raise CorruptError(f"CRC of {len(adu)} bytes is wrong: {bytes(adu[:16]).hex(' ')}")
     if adu[0] != unit:

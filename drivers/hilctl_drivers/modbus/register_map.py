@@ -37,19 +37,12 @@ _Permute: TypeAlias = Callable[[Bytes], tuple[int, ...]]
 
 @dataclass(frozen=True)
 class RegisterFormat:
-    """Encoding of one value in its registers; what is not valid raises BadRequestError.
+    """Encoding of one value in its registers; what is not valid raises BadRequestError."""
 
-    Attributes:
-        type: Number type of the raw value.
-        order: Byte order in ABCD notation; empty for most significant byte first.
-        scale: Value of one raw step, in the channel's unit; finite and not 0.
-        offset: Value at raw 0, in the channel's unit; finite.
-    """
-
-    type: RegisterType
-    order: str = ""
-    scale: float = 1.0
-    offset: float = 0.0
+    type: RegisterType  # number type of the raw value
+    order: str = ""  # byte order in ABCD notation; empty for most significant byte first
+    scale: float = 1.0  # value of one raw step, in the channel's unit; finite and not 0
+    offset: float = 0.0  # value at raw 0, in the channel's unit; finite
     size: int = field(init=False, repr=False, compare=False)
     """Bytes of the value."""
     # Bound once: each look-up of a bound method costs as much as a tenth of the encoding.

@@ -74,19 +74,13 @@ class StreamInput(FrameChannel):
 
 
 class StreamProfile(BaseProfile):
-    """A sensor that sends samples unasked.
-
-    Attributes:
-        link: TCP connection.
-        header: Header of a block.
-        inputs: Values of a frame by name.
-    """
+    """A sensor that sends samples unasked."""
 
     DEVICE: ClassVar[str] = "serial_dac"
     READER: ClassVar[str] = "hilctl_drivers.sensor_stream.stream_reader:StreamReader"
 
-    link: SensorStreamLink
-    header: StreamHeader
+    link: SensorStreamLink = Field(description="TCP connection")
+    header: StreamHeader = Field(description="header of a block")
     outputs: dict[Name, Range] = Field(max_length=0)
-    inputs: dict[Name, StreamInput]
+    inputs: dict[Name, StreamInput] = Field(description="values of a frame by name")
     watchdog: Literal["none"]

@@ -7,11 +7,7 @@ from typing import cast
 
 from hilctl_drivers.dac_setup import DacSetup, SensorReader
 from hilctl_drivers.endpoint import Endpoint
-from hilctl_drivers.sensor_stream.stream_profile import (
-    HeaderField,
-    StreamInput,
-    StreamProfile,
-)
+from hilctl_drivers.sensor_stream.stream_profile import HeaderField, StreamInput, StreamProfile
 from hilctl_drivers.transport.links import CorruptError, Link, NoAnswerError
 from hilctl_drivers.transport.tcp import TcpReceiver
 from hilctl_drivers.transport.wire_time import WireTime

@@ -15,13 +15,7 @@ import numpy as np
 
 from hilctl.base.device import AuxChannel, DeviceInfo, DeviceOptions, VoltageLimit
 from hilctl.base.errors import DeviceError, InputError
-from hilctl.base.strict import (
-    Field,
-    StrictModel,
-    ValidationInfo,
-    field_validator,
-    model_validator,
-)
+from hilctl.base.strict import Field, StrictModel, ValidationInfo, field_validator, model_validator
 from hilctl.base.types import F64
 from hilctl_drivers.device import CalibrationName, DacDevice, details_of
 from hilctl_drivers.simulated.actuator_base import Plant, RodParameters

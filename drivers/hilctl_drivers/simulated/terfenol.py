@@ -312,13 +312,5 @@ class TerfenolActuator(Plant):
             creep(free, self._creep, self._rest_um)
         if self._thermal is not None:
             warm(halves, noise_um, self._warmth, self._thermal, self._substeps)
-        respond(
-            free,
-            noise_um,
-            displacement_um,
-            self._mechanics,
-            self._motion,
-            self._rest_um,
-            self._sensor,
-            self._substeps,
-        )
+        fixed = self._mechanics, self._motion, self._rest_um, self._sensor, self._substeps
+        respond(free, noise_um, displacement_um, *fixed)

@@ -152,21 +152,7 @@ class SwitchingActuator(Plant):
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
         free_um = np.empty(command.size * self._substeps)
         _switch(
-            command,
-            measured,
-            free_um,
-            self._drive,
-            self._domains,
-            self._constants,
-            self._substeps,
+            command, measured, free_um, self._drive, self._domains, self._constants, self._substeps
         )
-        respond(
-            free_um,
-            noise_um,
-            displacement_um,
-            self._mechanics,
-            self._motion,
-            self._rest_um,
-            self._sensor,
-            self._substeps,
-        )
+        fixed = self._mechanics, self._motion, self._rest_um, self._sensor, self._substeps
+        respond(free_um, noise_um, displacement_um, *fixed)

@@ -18,6 +18,8 @@ from dataclasses import dataclass
 from types import MappingProxyType
 from typing import Literal, TypeAlias
 
+import numpy as np
+
 Bytes: TypeAlias = bytes | bytearray | memoryview
 CrcName: TypeAlias = Literal["crc16_modbus", "crc16_ccitt_false", "crc16_xmodem", "crc32", "none"]
 """Names of CRCs in profiles."""
@@ -41,18 +43,15 @@ class Crc:
         return self.compute(data).to_bytes(self.size, "little")
 
 
-def _reflected_table(poly: int) -> tuple[int, ...]:
-    """Return the byte table of a 16-bit CRC that shifts right; ``poly`` already reflected."""
-    table = []
-    for byte in range(256):
-        value = byte
-        for _ in range(8):
-            value = value >> 1 ^ poly if value & 1 else value >> 1
-        table.append(value)
-    return tuple(table)
+def _modbus_table(bits: int) -> "array[int]":
+    """Return what ``bits`` bits at once do to the CRC: uint16[2**bits], of CRC xor bits."""
+    values = np.arange(1 << bits)
+    for _ in range(bits):
+        values = values >> 1 ^ np.where(values & 1, 0xA001, 0)
+    return array("H", values.tolist())
 
 
-_MODBUS = _reflected_table(0xA001)
+_MODBUS_BYTES = _modbus_table(8)
 
 
 def crc16_modbus(data: Bytes) -> int:
@@ -62,20 +61,11 @@ def crc16_modbus(data: Bytes) -> int:
     """
     crc = 0xFFFF
     for byte in data:
-        crc = crc >> 8 ^ _MODBUS[(crc ^ byte) & 0xFF]
+        crc = crc >> 8 ^ _MODBUS_BYTES[(crc ^ byte) & 0xFF]
     return crc
 
 
-def _word_table() -> "array[int]":
-    """Return what two bytes at once do to the CRC: uint16[65536], of CRC xor bytes."""
-    table = array("H", bytes(2 * 0x10000))
-    for word in range(0x10000):
-        half = word >> 8 ^ _MODBUS[word & 0xFF]
-        table[word] = half >> 8 ^ _MODBUS[half & 0xFF]
-    return table
-
-
-MODBUS_WORDS = _word_table()
+MODBUS_WORDS = _modbus_table(16)
 """For loops that can't afford a call: ``crc = MODBUS_WORDS[crc ^ word]`` is :func:`crc16_modbus` of
 two bytes, the first the low one of ``word``, in less than half the time."""
 

@@ -11,7 +11,7 @@ from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator
 from contextlib import suppress
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, TypeVar
+from typing import ClassVar, Literal, TypeAlias, TypeVar
 
 from cobs import cobs
 
@@ -68,15 +68,12 @@ LENGTH_SIZE = 2
 
 @dataclass(frozen=True)
 class Framing(ABC):
-    """A binary framing: payload to frame, frame to payload, stream to payloads.
+    """A binary framing: payload to frame, frame to payload, stream to payloads."""
 
-    Attributes:
-        crc: The check.
-        payload_max: Most bytes of a payload.
-    """
-
-    crc: Crc
-    payload_max: int = PAYLOAD_MAX
+    BEFORE: ClassVar[bytes] = b""
+    """Sent first if a truncated frame may precede it, so that the two do not become one."""
+    crc: Crc  # the check
+    payload_max: int = PAYLOAD_MAX  # most bytes of a payload
 
     def encode(self, payload: Bytes) -> bytes:
         """Return the complete frame of a payload of 1 to ``payload_max`` bytes."""
@@ -85,7 +82,6 @@ class Framing(ABC):
             raise BadRequestError(f"{rule}, got {len(payload)}")
         return self._frame(bytes(payload))
 
-    @abstractmethod
     def decode(self, frame: Bytes) -> bytes:
         """Return the payload of exactly one frame.
 
@@ -93,6 +89,17 @@ class Framing(ABC):
             IncompleteError: More bytes belong to it.
             CorruptError: Its CRC or structure is wrong, or bytes follow its end.
         """
+        size = self._size_of(frame)
+        if not size or len(frame) < size:
+            raise IncompleteError(f"{len(frame)} bytes of a frame")
+        if len(frame) > size:
+            raise CorruptError(f"{len(frame) - size} bytes behind the end of the frame")
+        return self._payload(bytes(frame))
+
+    def missing(self, received: bytearray) -> int:
+        """Return how many bytes a frame has at least after the received ones; 0 if it is whole."""
+        size = self._size_of(received)
+        return max(0, size - len(received)) if size else 1
 
     @abstractmethod
     def wire_size(self, payload_size: int) -> int:
@@ -105,6 +112,14 @@ class Framing(ABC):
     @abstractmethod
     def _frame(self, payload: bytes) -> bytes:
         """Return the frame of a payload of good size."""
+
+    @abstractmethod
+    def _size_of(self, data: Bytes) -> int:
+        """Return the size of the frame at the beginning, 0 if it is not known yet."""
+
+    @abstractmethod
+    def _payload(self, frame: Bytes) -> bytes:
+        """Return the payload of a complete frame, or raise CorruptError."""
 
     def _check_size(self, size: int) -> None:
         if not 1 <= size <= self.payload_max:
@@ -120,21 +135,11 @@ class Framing(ABC):
 class CobsFraming(Framing):
     """COBS frames, see the module."""
 
+    BEFORE: ClassVar[bytes] = b"\0"
+
     def _frame(self, payload: bytes) -> bytes:
         body: bytes = cobs.encode(payload + self.crc.of(payload))
         return body + b"\0"
-
-    def decode(self, frame: Bytes) -> bytes:
-        """See :meth:`Framing.decode`."""
-        frame = bytes(frame)
-        end = frame.find(0)
-        if end < 0 and len(frame) < self.wire_size(self.payload_max):
-            raise IncompleteError(f"{len(frame)} bytes without the final 00")
-        if end < 0:
-            raise CorruptError(f"no final 00 within {len(frame)} bytes")
-        if end < len(frame) - 1:
-            raise CorruptError(f"{len(frame) - end - 1} bytes behind the final 00")
-        return self._payload(frame[:-1])
 
     def wire_size(self, payload_size: int) -> int:
         """See :meth:`Framing.wire_size`."""
@@ -145,9 +150,15 @@ class CobsFraming(Framing):
         """See :meth:`Framing.messages`."""
         return split_at(received, b"\0", self._payload)
 
-    def _payload(self, body: Bytes) -> bytes:
+    def _size_of(self, data: Bytes) -> int:
+        size = bytes(data).find(0) + 1
+        if not size and len(data) >= self.wire_size(self.payload_max):
+            raise CorruptError(f"no final 00 within {len(data)} bytes")
+        return size
+
+    def _payload(self, frame: Bytes) -> bytes:
         try:
-            data: bytes = cobs.decode(bytes(body))
+            data: bytes = cobs.decode(bytes(frame).removesuffix(b"\0"))
         except cobs.DecodeError as error:
             raise CorruptError(f"not a COBS frame: {error}") from None
         size = len(data) - self.crc.size
@@ -168,15 +179,6 @@ class LengthFraming(Framing):
         body = len(payload).to_bytes(LENGTH_SIZE, "little") + payload
         return body + self.crc.of(body)
 
-    def decode(self, frame: Bytes) -> bytes:
-        """See :meth:`Framing.decode`."""
-        size = self._size_of(frame)
-        if not size or len(frame) < size:
-            raise IncompleteError(f"{len(frame)} bytes of a frame")
-        if len(frame) > size:
-            raise CorruptError(f"{len(frame) - size} bytes behind the end of the frame")
-        return self._payload(bytes(frame))
-
     def wire_size(self, payload_size: int) -> int:
         """See :meth:`Framing.wire_size`."""
         return LENGTH_SIZE + payload_size + self.crc.size
@@ -186,17 +188,17 @@ class LengthFraming(Framing):
         return split_sized(received, self._size_of, self._payload)
 
     def _size_of(self, data: Bytes) -> int:
-        """Return the size of the frame at the beginning, 0 if it is not known yet."""
         if len(data) < LENGTH_SIZE:
             return 0
         size = data[0] | data[1] << 8
         self._check_size(size)
         return self.wire_size(size)
 
-    def _payload(self, frame: bytes) -> bytes:
-        end = len(frame) - self.crc.size
-        self._check_crc(frame[:end], frame[end:])
-        return frame[LENGTH_SIZE:end]
+    def _payload(self, frame: Bytes) -> bytes:
+        data = bytes(frame)
+        end = len(data) - self.crc.size
+        self._check_crc(data[:end], data[end:])
+        return data[LENGTH_SIZE:end]
 
 
 def binary_framing(kind: FramingKind, crc: str, payload_max: int = PAYLOAD_MAX) -> Framing:

@@ -209,13 +209,7 @@ class TcpStream(StreamLink):
     LOST = "connection lost:"
 
     def __init__(
-        self,
-        host: str,
-        port: int,
-        timeout_s: float,
-        gap_s: float = 0.0,
-        *,
-        echo: bool = False,
+        self, host: str, port: int, timeout_s: float, gap_s: float = 0.0, *, echo: bool = False
     ) -> None:
         super().__init__(gap_s, timeout_s, echo=echo)
         self._host, self._port = host, port  # a numeric address after connecting

@@ -15,20 +15,15 @@ _FEEDS_A_TIMEOUT = 3.0
 
 @dataclass(frozen=True, slots=True)
 class WireTime:
-    """The duration of an exchange; each part is the sum over all requests.
+    """The duration of an exchange; each part is the sum over all requests."""
 
-    Attributes:
-        what: Requests and line, like ``FC23 at 115200 8N1``.
-        samples: Samples of one exchange.
-    """
-
-    what: str
+    what: str  # requests and line, like ``FC23 at 115200 8N1``
     request_s: float
     reply_s: float
     gaps: int
     gaps_s: float
     turnaround_s: float
-    samples: int = 1
+    samples: int = 1  # samples of one exchange
     settle_s: float = 0.0
 
     @property

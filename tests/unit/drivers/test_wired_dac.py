@@ -70,7 +70,7 @@ FAULTS = {
     "silence": f"no answer within {TIMEOUT_S:g} s",
     "delay": f"no answer within {TIMEOUT_S:g} s",
     "corrupt": "checksum of|not an answer to this|crc16_ccitt_false of .* is wrong",
-    "cut": f"only . bytes, 1 short, within {TIMEOUT_S:g} s",
+    "cut": rf"only . bytes, \d+ short, within {TIMEOUT_S:g} s",
     "duplicate": "must be one line|bytes behind",
     "wrong_id": "not an answer to this|reply 90 to message",
     "exception": "invalid command|no answer within|refused by the board",

@@ -9,7 +9,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.ascii.ascii_dac import AsciiDac
-from hilctl_drivers.ascii.ascii_session import feed_time
+from hilctl_drivers.ascii.ascii_session import TextReader
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.wired_dac import SerialOptions
 
@@ -32,7 +32,7 @@ def test_what_measures_the_output_is_an_input_that_says_so():
 
 def test_a_strict_watchdog_slows_the_loop():
     bare, fed = device().info, device(watchdog={"timeout_s": 1.0}).info
-    feed_s = feed_time(load_profile(DCON)).total_s
+    feed_s = TextReader.feed_time(load_profile(DCON)).total_s
     assert 1.0 / fed.max_rate_hz - 1.0 / bare.max_rate_hz == pytest.approx(feed_s)
     assert "feed the watchdog" in fed.rate_note
     assert "to feed" not in bare.rate_note

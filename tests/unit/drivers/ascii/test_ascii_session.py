@@ -11,8 +11,8 @@ from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
     FrameFormat,
     LineFormat,
+    TextReader,
     exchange_time,
-    feed_time,
     formats,
     parse_number,
 )
@@ -185,11 +185,11 @@ class TestText:
 
 @pytest.mark.parametrize("name", ["kepco_bop", "tdk_lambda_gen"])
 def test_devices_without_a_strict_watchdog_cost_nothing(name):
-    assert feed_time(load_profile(name)) is None
+    assert TextReader.feed_time(load_profile(name)) is None
 
 
 def test_an_unanswered_line_costs_its_characters():
-    time = feed_time(load_profile("icp_m7024_dcon"))
+    time = TextReader.feed_time(load_profile("icp_m7024_dcon"))
     assert time.total_s == time.request_s == pytest.approx(len("~**\r") * 10 / 9600)
 
 

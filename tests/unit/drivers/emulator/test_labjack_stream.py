@@ -7,8 +7,8 @@ import pytest
 
 from hilctl_drivers.emulator.labjack_stream import LabJackInput
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.stream import ModbusFeedback
-from hilctl_drivers.modbus.pdu import ReadFrame, WriteFrame
+from hilctl_drivers.modbus.modbus_session import ModbusSession
+from hilctl_drivers.modbus.pdu import read_frame, write_frame
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import RefusedError
 from tests.fakes import InProcess
@@ -33,13 +33,14 @@ class Device:
     def __init__(self):
         self.emulated = InProcess.of("labjack_t7")
         self.emulated.link.open()
-        self._feedback = ModbusFeedback(self.emulated.link, 1)
+        profile, link = load_profile("labjack_t7"), self.emulated.link
+        self.feedback = ModbusSession(profile, link, 1, framing="tcp").feedback
 
     def write(self, address, data):
-        self._feedback.call([WriteFrame(address, data)])
+        self.feedback(write_frame(address, data))
 
     def read(self, address):
-        return int.from_bytes(self._feedback.read(address, 2), "big")
+        return int.from_bytes(self.feedback(read_frame(address, 2))[0], "big")
 
     def set_up(self, rate_hz=1000.0, **changes):
         for address, value in {**SETTINGS, **changes.get("settings", {})}.items():
@@ -47,11 +48,12 @@ class Device:
         self.write(4002, f32(rate_hz))
 
     def play(self, *volts):
-        self._feedback.call([WriteFrame(4400, f32(*volts)), WriteFrame(4070, u32(1))])
+        self.feedback(write_frame(4400, f32(*volts)), write_frame(4070, u32(1)))
 
     def data(self, samples):
         """Return samples, backlog, status, what belongs to it, and the readings."""
-        found = struct.unpack(f">{4 + samples}H", self._feedback.read(4500, 4 + samples))
+        (data,) = self.feedback(read_frame(4500, 4 + samples))
+        found = struct.unpack(f">{4 + samples}H", data)
         return *found[:4], list(found[4 : 4 + found[0]])
 
     def wait(self, seconds):
@@ -140,7 +142,7 @@ def test_what_it_can_not_do_is_refused(device, what, code):
 
 def test_calibration_constants_are_read_by_pointer(device):
     device.write(61810, u32(0x3C4000))
-    data = device._feedback.call([ReadFrame(61812, 8)])[0]
+    (data,) = device.feedback(read_frame(61812, 8))
     assert struct.unpack(">4f", data) == pytest.approx(
         (0.000315805780, -0.000315805800, 33523.0, -10.586956522)
     )

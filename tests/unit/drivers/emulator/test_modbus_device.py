@@ -24,17 +24,17 @@ def test_powers_up_as_its_profile_says(name, output, sensor, more, current_a, va
 
 def test_trip_that_a_step_clears_keeps_the_command():
     device = emulated_modbus("wago_750", "AO0", "AI0")
-    device.write("holding", 0, [16384])
+    device.write("holding", 0, b"\x40\0")
     device._watchdog.armed = device._watchdog.tripped = True
     device._trip(0)
     assert device._rig.command == 0.0
-    assert device._outputs["AO0"].words == [16384]
+    assert device._outputs["AO0"].data == b"\x40\0"
     with pytest.raises(RejectedRequest):
-        device.write("holding", 0, [100])
-    device.write("holding", 0x1007, [1])
+        device.write("holding", 0, b"\0\x64")
+    device.write("holding", 0x1007, b"\0\1")
     assert not device.tripped
     assert device._rig.command == 0.0
-    device.write("holding", 0, [100])
+    device.write("holding", 0, b"\0\x64")
     assert device._rig.command == pytest.approx(100 * 10 / 32767)
 
 
@@ -50,9 +50,8 @@ class Registers:
         self.watchdog = EmulatedWatchdog(profile.watchdog, self.map.steps)
 
     def write(self, address, value, now_ns):
-        words = [value >> 16, value & 0xFFFF]
-        ((target, given),) = self.map.targets("holding", address, words)
-        target.words[:] = given
+        ((target, given),) = self.map.targets("holding", address, value.to_bytes(4, "big"))
+        target.data = given
         self.watchdog.written(target, now_ns)
 
 

@@ -14,11 +14,11 @@ BIT = Register(area="coil", address=3, type="bit")
 def test_words_stand_for_a_value_in_the_register_s_own_order():
     words = Words(FLOAT)
     words.value = 1.5
-    assert words.words == [0x0000, 0x3FC0]
+    assert words.data == bytes.fromhex("0000 3fc0")
     assert words.value == 1.5
     bit = Words(BIT)
     bit.value = 7.0
-    assert (bit.words, bit.value) == ([1], 1.0)
+    assert (bit.data, bit.value) == (b"\0\1", 1.0)
 
 
 PROFILE = load_profile("labjack_t7")
@@ -31,25 +31,26 @@ def t7():
 
 
 def test_all_of_a_value_is_written_or_nothing(t7):
-    ((target, words),) = t7.targets("holding", 1000, [1, 2])
-    assert words == [1, 2]
-    target.words[:] = words
-    assert t7.read(["holding"], 1000, 2) == t7.written("holding", 1000, 2) == [1, 2]
-    for address, values in ((1000, [1]), (1001, [1]), (1000, [1, 2, 3])):
+    given = b"\0\1\0\2"
+    ((target, data),) = t7.targets("holding", 1000, given)
+    assert data == given
+    target.data = data
+    assert t7.read(["holding"], 1000, 2) == t7.written("holding", 1000, 2) == given
+    for address, size in ((1000, 2), (1001, 2), (1000, 6)):
         with pytest.raises(RejectedRequest):
-            t7.targets("holding", address, values)
+            t7.targets("holding", address, bytes(size))
 
 
 def test_what_is_read_only_is_not_there_for_writes(t7):
-    assert t7.read(["coil", "input"], 0, 2) == [0, 0]
+    assert t7.read(["coil", "input"], 0, 2) == bytes(4)
     with pytest.raises(RejectedRequest):
-        t7.targets("input", 0, [1, 2])
+        t7.targets("input", 0, bytes(4))
     with pytest.raises(RejectedRequest):
         t7.read(["coil"], 0, 1)
 
 
 def test_a_profile_s_registers_are_all_there(t7):
     t7.outputs["DAC0"].value = 2.5
-    assert t7.read(["holding"], 1000, 2) == [0x4020, 0]
-    assert t7.read(["holding"], 55100, 2) == [0x0011, 0x2233]
+    assert t7.read(["holding"], 1000, 2) == bytes.fromhex("4020 0000")
+    assert t7.read(["holding"], 55100, 2) == bytes.fromhex("0011 2233")
     assert {id(step) for step in PROFILE.init} <= t7.steps.keys()

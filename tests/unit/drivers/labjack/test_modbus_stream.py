@@ -4,7 +4,6 @@ import re
 import struct
 from contextlib import nullcontext
 from dataclasses import dataclass, replace
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -18,7 +17,6 @@ from hilctl_drivers.labjack.modbus_stream import (
     stream_time,
 )
 from hilctl_drivers.labjack.stream import VALUES_MAX
-from hilctl_drivers.modbus.pdu import WriteFrame
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.fakes import T7_OPTIONS, FaultyLink, InProcess, InProcessLink, logged, made_safe
@@ -145,7 +143,7 @@ def test_the_device_keeps_the_pace(driven):
     before = made.time()
     made.hold(1.0, 50)
     assert made.time() - before == pytest.approx(50 * BLOCK / RATE_HZ, rel=0.01)
-    assert made.device.stream.level_min > (FIFO_BLOCKS - 1.1) * BLOCK
+    assert made.device._stream.level_min > (FIFO_BLOCKS - 1.1) * BLOCK
     assert made.clock.underruns == 0
 
 
@@ -354,8 +352,8 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
     device = driven().device
     device._write = lambda data: None
     encoded = device._setup.output.format.encode(held_v)
-    answer = SimpleNamespace(call=lambda frames: [stream.u32(running), encoded])
-    monkeypatch.setattr("hilctl_drivers.labjack.modbus_stream.ModbusFeedback", lambda *_: answer)
+    answer = [stream.u32(running), encoded]
+    monkeypatch.setattr(device._writer, "feedback", lambda *frames: answer)
     with nullcontext() if holds else pytest.raises(DeviceError):
         device._confirm(1.0)
 
@@ -386,6 +384,10 @@ DAC0, AIN0 = 1000, 0
 CAPACITY = 8000
 
 
+def address_of(frame):
+    return int.from_bytes(frame[1:3], "big")
+
+
 class Scripted:
     """A device that answers as told: readings, scans left in it, and values that it still holds.
 
@@ -397,25 +399,25 @@ class Scripted:
         self.given, self.fed, self.calls = 0, 0, 0
         self.written = []
 
-    def read(self, address, words):
-        if address == stream.SCANRATE_HZ:
-            return stream.f32(self.makes_hz)
-        if address == stream.OUT_BUFFER_STATUS:
-            return stream.u32(CAPACITY - self.fed)
-        return stream.u32(int(self.starts))
-
-    def call(self, frames):
-        written = [each for each in frames if isinstance(each, WriteFrame)]
-        self.written += [(each.address, each.data.hex()) for each in written]
-        self.fed += sum(len(w.data) // 4 for w in written if w.address == stream.OUT_BUFFER_F32)
+    def feedback(self, *frames):
+        written = [(address_of(each), each[4:]) for each in frames if each[0]]
+        self.written += [(address, data.hex()) for address, data in written]
+        self.fed += sum(len(data) // 4 for at, data in written if at == stream.OUT_BUFFER_F32)
         if frames[0] is not stream.READ_FRAMES[0]:
-            return []
+            return [self.register(address_of(each)) for each in frames if not each[0]]
         self.calls += 1
         count, backlog, held = self.answers.pop(0)
         head = stream.DATA_HEAD.pack(count, 2 * backlog, 0, 0)
         readings = np.arange(self.given, self.given + count).astype(">u2").tobytes()
         self.given += count
         return head + readings, stream.u32(CAPACITY - held)
+
+    def register(self, address):
+        if address == stream.SCANRATE_HZ:
+            return stream.f32(self.makes_hz)
+        if address == stream.OUT_BUFFER_STATUS:
+            return stream.u32(CAPACITY - self.fed)
+        return stream.u32(int(self.starts))
 
 
 @dataclass
@@ -583,14 +585,11 @@ def test_calibration_is_read_from_flash(name, form, address, constants):
     asked = []
 
     class Flash:
-        def call(self, frames):
-            asked.extend((each.address, each.data) for each in frames)
-
-        def read(self, address, words):
-            asked.append((address, words))
-            return constants
+        def feedback(self, frame):
+            asked.append((frame[0], address_of(frame), frame[3:] if frame[0] else frame[3]))
+            return [constants]
 
     session = StreamSession(Flash(), load_profile(name).streaming, 0.1, 0.001)
     assert session.calibration(2) == stream.InputCalibration.decode(form, constants)
-    pointer = (stream.FLASH_READ_POINTER, stream.u32(address))
-    assert asked == [pointer, (stream.FLASH_READ, len(constants) // 2)]
+    pointer = (1, stream.FLASH_READ_POINTER, b"\2" + stream.u32(address))
+    assert asked == [pointer, (0, stream.FLASH_READ, len(constants) // 2)]

@@ -7,8 +7,9 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.stream import ModbusFeedback
-from hilctl_drivers.modbus.pdu import ReadFrame, WriteFrame, feedback_pdu
+from hilctl_drivers.modbus.modbus_session import ModbusSession
+from hilctl_drivers.modbus.pdu import feedback_pdu, read_frame, reply_size, write_frame
+from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import MismatchError, RefusedError
 
 DOCUMENTED = {
@@ -40,15 +41,14 @@ def test_a_message_is_as_long_as_it_may_be():
     """58 values and 120 readings fill a message of 253 bytes."""
     assert (stream.VALUES_MAX, stream.SAMPLES_MAX) == (58, 120)
     full = [*stream.READ_FRAMES, *stream.value_frames(np.zeros(stream.VALUES_MAX))]
-    assert len(feedback_pdu(*full)) == 253
-    assert 1 + sum(frame.reply_size for frame in full) == 253
+    assert len(feedback_pdu(*full)) == reply_size(feedback_pdu(*full)) == 253
 
 
 def test_data_tell_readings_backlog_and_room():
     data = words(3, 40, 0, 0, 100, 200, 300) + bytes(20)
-    found = stream.stream_data(data, stream.u32(8000))
-    assert found.raw.tolist() == [100, 200, 300]
-    assert (found.backlog, found.free) == (20, 8000)
+    raw, backlog, free = stream.stream_data(data, stream.u32(8000))
+    assert raw.tolist() == [100, 200, 300]
+    assert (backlog, free) == (20, 8000)
 
 
 @pytest.mark.parametrize(("head", "text"), [
@@ -129,22 +129,23 @@ def answered(pdu, transaction=None, unit=1):
     return Link(answer)
 
 
+def session(link):
+    return ModbusSession(load_profile("labjack_t7"), link, 1, framing="tcp")
+
+
 def test_the_whole_message_is_modbus_tcp():
     link = answered(bytes.fromhex("4c 3f800000"))
-    feedback = ModbusFeedback(link, 1)
-    assert feedback.read(0, 2) == bytes.fromhex("3f800000")
+    feedback = session(link).feedback
+    assert feedback(read_frame(0, 2)) == [bytes.fromhex("3f800000")]
     assert link.request == bytes.fromhex("0001 0000 0006 01 4c 00 0000 02")
-    feedback.read(0, 2)
+    feedback(read_frame(0, 2))
     assert link.request[:2] == b"\x00\x02"
 
 
 def test_each_read_frame_gets_its_words():
     link = answered(bytes.fromhex("4c 0011 22334455"))
-    frames = [ReadFrame(55110, 1), WriteFrame(1000, bytes(4)), ReadFrame(55120, 2)]
-    assert ModbusFeedback(link, 1).call(frames) == [
-        bytes.fromhex("0011"),
-        bytes.fromhex("22334455"),
-    ]
+    frames = [read_frame(55110, 1), write_frame(1000, bytes(4)), read_frame(55120, 2)]
+    assert session(link).feedback(*frames) == [bytes.fromhex("0011"), bytes.fromhex("22334455")]
 
 
 @pytest.mark.parametrize(("link", "error", "text"), [
@@ -156,4 +157,4 @@ def test_each_read_frame_gets_its_words():
 ])  # fmt: skip
 def test_an_answer_to_something_else_is_an_error(link, error, text):
     with pytest.raises(error, match=text):
-        ModbusFeedback(link, 1).read(0, 2)
+        session(link).feedback(read_frame(0, 2))

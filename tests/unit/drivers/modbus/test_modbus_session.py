@@ -8,21 +8,21 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 from hilctl_drivers.modbus.modbus_session import (
+    ModbusReader,
     ModbusSession,
     RtuTransaction,
     TcpTransaction,
     exchange_time,
-    feed_time,
 )
 from hilctl_drivers.modbus.pdu import (
-    ReadFrame,
-    WriteFrame,
     coil_pdu,
     feedback_pdu,
+    read_frame,
     read_pdu,
     reply_size,
     rtu_adu,
     tcp_adu,
+    write_frame,
     write_pdu,
     write_read_pdu,
     write_single_pdu,
@@ -304,12 +304,12 @@ READ, WRITE = read_pdu(3, 101, 1), write_single_pdu(101, bytes(2))
     ("{kind: write, area: coil, address: 7, type: bit, value: 1}", requests_s(coil_pdu(7, True))),
 ])  # fmt: skip
 def test_each_kind_of_step_counts_with_all_that_it_may_send(feed, seconds):
-    assert feed_time(acme(feed)).total_s == pytest.approx(seconds)
+    assert ModbusReader.feed_time(acme(feed)).total_s == pytest.approx(seconds)
 
 
 @pytest.mark.parametrize("name", ["labjack_t7", "wago_750", "adam_6024"])
 def test_watchdogs_that_exchanges_feed_cost_nothing(name):
-    assert feed_time(load_profile(name)) is None
+    assert ModbusReader.feed_time(load_profile(name)) is None
 
 
 def test_modbus_dac_leaves_room_for_feeding(tmp_path):
@@ -390,7 +390,7 @@ CASES = {
         REPLY,
     ),
     "feedback": (
-        lambda d: feedback_pdu(ReadFrame(0, 2), WriteFrame(9, d)),
+        lambda d: feedback_pdu(read_frame(0, 2), write_frame(9, d)),
         4,
         lambda _: b"\x4c" + REPLY,
         REPLY,

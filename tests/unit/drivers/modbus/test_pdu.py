@@ -17,10 +17,9 @@ from pymodbus.pdu.register_message import (
 )
 
 from hilctl_drivers.modbus.pdu import (
-    ReadFrame,
-    WriteFrame,
     coil_pdu,
     feedback_pdu,
+    read_frame,
     read_pdu,
     reply_data,
     reply_size,
@@ -28,6 +27,7 @@ from hilctl_drivers.modbus.pdu import (
     rtu_pdu,
     tcp_adu,
     tcp_pdu,
+    write_frame,
     write_pdu,
     write_read_pdu,
     write_single_pdu,
@@ -45,7 +45,7 @@ FOUR = H("01020304")
 
 
 def read_and_write(target, data, source, words):
-    return feedback_pdu(ReadFrame(source, words), WriteFrame(target, data))
+    return feedback_pdu(read_frame(source, words), write_frame(target, data))
 
 
 EXAMPLES = [

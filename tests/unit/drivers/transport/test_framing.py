@@ -91,7 +91,7 @@ def test_a_beginning_is_incomplete_and_a_tail_is_corrupt(framing):
 def test_cobs_size_on_the_wire_is_the_largest_there_is():
     framing = CobsFraming(CRCS["none"], payload_max=8)
     assert len(framing.encode(b"\xff" * 8)) == framing.wire_size(8) == 10
-    with pytest.raises(IncompleteError, match=r"^9 bytes without"):
+    with pytest.raises(IncompleteError, match=r"^9 bytes of a frame"):
         framing.decode(b"\x01" * 9)
     with pytest.raises(CorruptError, match=r"within 10 bytes"):
         framing.decode(b"\x01" * 10)
