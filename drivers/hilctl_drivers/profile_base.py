@@ -331,17 +331,11 @@ class BaseProfile(StrictModel):
         self, what: str, sent: int, received: int, gaps: int, replies: int, settle_s: float
     ) -> WireTime:
         """Return the time of characters sent and received, of gaps, and of devices to answer."""
-        link = self.link
-        gaps = gaps if link.silence_s else 0
-        return WireTime(
-            f"{what} {link.medium}",
-            sent * link.char_s,
-            received * link.char_s,
-            gaps,
-            gaps * link.silence_s,
-            replies * self.turnaround_s,
-            settle_s=settle_s,
-        )
+        link, char_s, silence_s = self.link, self.link.char_s, self.link.silence_s
+        gaps = gaps if silence_s else 0
+        parts = sent * char_s, received * char_s, gaps, gaps * silence_s
+        turnaround_s = replies * self.turnaround_s
+        return WireTime(f"{what} {link.medium}", *parts, turnaround_s, settle_s=settle_s)
 
     def provenance(self, prefix: str = "") -> dict[str, str]:
         """Return device and sources of the profile, to keep with a recording."""

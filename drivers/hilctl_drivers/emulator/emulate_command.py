@@ -77,23 +77,27 @@ def wired_experiment(
     options: DacOptions = document.validate(
         SerialOptions, at=("device",), without=("kind",), context=context
     )
-    reader = options.reader
     unit = "A" if options.amplifier is None else options.amplifier.command_unit
+    of_reader: dict[str, Any] = {}
+    if (reader := options.reader) is not None:
+        of_reader = {
+            "reader": _found(reader.profile, path.parent),
+            "reader_link": _link(reader),
+            "reader_line": "own" if reader.host or reader.serial_port else "same",
+            "reader_unit_id": reader.unit_id,
+            "reader_port": _port(reader),
+        }
     made = EmulatorOptions(
         profile=_found(options.profile, path.parent),
         link=_link(options),
-        reader_link=None if reader is None else _link(reader),
         host=host or EmulatorOptions.host,
         port=port or _port(options),
         output=options.output,
         sensor=options.input,
-        reader=_found(reader.profile, path.parent) if reader else None,
-        reader_line=_line(reader),
-        reader_unit_id=reader.unit_id if reader else None,
-        reader_port=_port(reader),
         actuator=_actuator(unit, actuator, document.data.get("amplifier")),
         wiring=(options.amplifier, options.sensor),
         limits=limited_range(document.data.get("limits")),
+        **of_reader,
     )
     return WiredExperiment(path, section, made)
 
@@ -104,17 +108,10 @@ def _found(named: NamedProfile, folder: Path) -> str:
     return str(folder / path) if path.suffix or len(path.parts) > 1 else named.name
 
 
-def _port(options: DacOptions | AddressOptions | None) -> int:
+def _port(options: AddressOptions) -> int:
     """Return the TCP port of options if users may listen there; otherwise 0, for a free one."""
-    given = getattr(options, "tcp_port", None) or 0
-    return given if getattr(options, "host", None) in _HERE and given >= _UNPRIVILEGED else 0
-
-
-def _line(reader: AddressOptions | None) -> Any:
-    if reader is None:
-        return None
-    apart = reader.serial_port is not None or getattr(reader, "host", None) is not None
-    return "own" if apart else "same"
+    given = options.tcp_port or 0
+    return given if options.host in _HERE and given >= _UNPRIVILEGED else 0
 
 
 def _actuator(
@@ -215,29 +212,22 @@ def emulate(
 ) -> None:
     """Emulate a device with the simulated rig, until Ctrl-C."""
     wired = None
+    own: dict[str, Any] = {
+        "link": link, "output": output, "sensor": sensor, "reader": reader,
+        "reader_line": reader_line, "reader_unit_id": reader_unit_id,
+    }  # fmt: skip
     if is_experiment(profile):
-        own = {"--link": link, "--output": output, "--sensor": sensor, "--reader": reader,
-               "--reader-line": reader_line, "--reader-unit-id": reader_unit_id,
-               "--unit": unit}  # fmt: skip
-        if given := [name for name, value in own.items() if value is not None]:
-            raise InputError(f"{', '.join(given)}: specified by {profile} already")
+        given = [key for key, value in (own | {"unit": unit}).items() if value is not None]
+        if given:
+            names = ", ".join(f"--{key.replace('_', '-')}" for key in given)
+            raise InputError(f"{names}: specified by {profile} already")
         wired = wired_experiment(Path(profile), port, host, actuator or ())
         options = wired.options
     else:
         if reader is None and sensor is not None and ":" in sensor:
-            reader, _, sensor = sensor.rpartition(":")
-        options = EmulatorOptions(
-            profile=profile,
-            link=link,
-            host=host,
-            port=port,
-            output=output,
-            sensor=sensor,
-            reader=reader,
-            reader_line=reader_line,
-            reader_unit_id=reader_unit_id,
-            actuator=_actuator(unit or "A", actuator or ()),
-        )
+            own["reader"], _, own["sensor"] = sensor.rpartition(":")
+        simulated = _actuator(unit or "A", actuator or ())
+        options = EmulatorOptions(profile, host=host, port=port, actuator=simulated, **own)
     faults = tuple(parse_fault(text) for text in fault or ())
     reader_port = reader_port or options.reader_port
     options = replace(options, log=log, faults=faults, command=command, reader_port=reader_port)

@@ -372,25 +372,22 @@ class TerfenolOptions(SimulatedOptions):
 
     def parameters(self) -> TerfenolParameters:
         """Return the actuator that the options describe."""
-        published = TerfenolParameters()
-        rated = replace(
-            published,
-            dac_range_a=published.dac_range_a / self._turns,
-            coil_factor_per_m=published.coil_factor_per_m * self._turns,
+        rated, drift = TerfenolParameters(), self.drift or Drift(um=0.0, tau_s=1.0)
+        made = replace(
+            rated,
+            dac_range_a=rated.dac_range_a / self._turns,
+            coil_factor_per_m=rated.coil_factor_per_m * self._turns,
+            magnet_field_a_per_m=rated.magnet_field_a_per_m if self.magnet else 0.0,
+            sensor_noise_um=rated.sensor_noise_um if self.noise else 0.0,
+            drift_um=drift.um,
+            drift_s=drift.tau_s,
             rods=PHYSICS[self.physics](),
             creep=self.creep,
             thermal=self.thermal,
             second_mode=self.second_mode,
             amplifier=self.amplifier,
         )
-        changes: dict[str, Any] = {}
-        if not self.noise:
-            changes["sensor_noise_um"] = 0.0
-        if not self.magnet:
-            changes["magnet_field_a_per_m"] = 0.0
-        if self.drift is not None:
-            changes |= {"drift_um": self.drift.um, "drift_s": self.drift.tau_s}
-        return replace(self.vary.of(rated), **changes)
+        return self.vary.of(made)
 
 
 class PiezoStage(DeviceOptions):

@@ -141,21 +141,10 @@ class DomainsParameters(RodParameters):
             torque = 2.0 * self.stress_pa * (form @ easy)
             constant = easy + torque / self.anisotropy_j_per_m3
             slope = zeeman / self.anisotropy_j_per_m3
-            columns.append(
-                [
-                    size,
-                    constant @ constant,
-                    2.0 * constant @ slope,
-                    slope @ slope,
-                    constant @ axis,
-                    slope @ axis,
-                    constant @ form @ constant,
-                    2.0 * constant @ form @ slope,
-                    slope @ form @ slope,
-                    constant @ easy,
-                    slope @ easy,
-                ]
-            )
+            square = constant @ constant, 2.0 * constant @ slope, slope @ slope
+            strain = constant @ form @ constant, 2.0 * constant @ form @ slope, slope @ form @ slope
+            along, near = ((constant @ each, slope @ each) for each in (axis, easy))
+            columns.append([size, *square, *along, *strain, *near])
         return np.ascontiguousarray(np.array(columns).T)
 
 

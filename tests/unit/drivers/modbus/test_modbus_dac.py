@@ -220,7 +220,7 @@ class TestSteps:
         """A self-test register with words swapped means another byte order than the profile's."""
         served = serve("labjack_t7")
         words, _ = served.emulator.device.memory._readable["holding", 55100]
-        words.words.reverse()
+        words.data = words.data[2:] + words.data[:2]
         with pytest.raises(DeviceError, match=r"self-test register 55100"):
             served.device().open(100.0, 1)
         assert served.events() == []
@@ -236,7 +236,7 @@ class TestSteps:
     def test_expectation_is_checked(self, serve):
         served = serve("icp_et7000")
         words, _ = served.emulator.device.memory._readable["coil", 631]
-        words.words[:] = [1]
+        words.data = b"\0\1"
         with pytest.raises(DeviceError, match="AI data format"):
             served.device().open(10.0, 1)
 
@@ -371,23 +371,23 @@ class TestErrorRegister:
     def test_refused_value_ends_exchanges(self, rig):
         rig.open()
         rig.exchange(1.0)
-        rig.emulated.device.write("holding", 6, [0xFF05])
+        rig.emulated.device.write("holding", 6, b"\xff\5")
         with pytest.raises(DeviceError, match=self.ERROR):
             rig.exchange(2.0)
         made_safe(rig.device, 0.0)
         assert rig.current_a == pytest.approx(0.0)
 
     def test_error_of_before_refuses_to_open(self, rig):
-        rig.emulated.device.write("holding", 6, [5])
+        rig.emulated.device.write("holding", 6, b"\0\5")
         with pytest.raises(DeviceError, match=self.ERROR):
             rig.open()
         assert rig.current_a == pytest.approx(0.0)
 
     def test_emulator_reports_a_value_out_of_range_there(self, rig):
         device = rig.emulated.device
-        device.write("holding", 0, [0x4130, 0])  # 11 V
-        assert device.read(["holding"], 6, 1) == [0xFF]
-        assert device.read(["holding"], 0, 2) == [0, 0]
+        device.write("holding", 0, bytes.fromhex("4130 0000"))  # 11 V
+        assert device.read(["holding"], 6, 1) == b"\0\xff"
+        assert device.read(["holding"], 0, 2) == bytes(4)
 
 
 class TestMeasure:

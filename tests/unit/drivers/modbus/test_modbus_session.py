@@ -100,7 +100,7 @@ class TestReader:
     def test_self_test_comes_before_anything_moves(self, serve):
         served = serve("adam_4024", "adam_4117")
         words, _ = served.emulator.reader.memory._readable["holding", 210]
-        words.words[:] = [0x4018]
+        words.data = b"\x40\x18"
         said = r"at /dev/pts/\d+: reader adam_4117, unit 2 at /dev/pts/\d+: self-test .* \(to open"
         with pytest.raises(DeviceError, match=said):
             served.device().open(5.0, 1)
@@ -110,15 +110,15 @@ class TestReader:
         served = serve("adam_4024", reader)
         state, _ = served.emulator.reader.memory._readable["holding", 7]
         device = served.running(5.0, baud=115200)
-        assert state.words == [1]
+        assert state.data == b"\0\1"
         exchange(device, 1.0)
         device.close()
-        assert state.words == [2]
+        assert state.data == b"\0\2"
 
     def test_expectations_are_checked(self, serve):
         served = serve("waveshare_ao_8ch", "waveshare_ai_8ch")
         words, _ = served.emulator.reader.memory._readable["holding", 0x1000]
-        words.words[:] = [3]
+        words.data = b"\0\3"
         with pytest.raises(DeviceError, match=r"reader waveshare_ai_8ch.* 0 to 20 mA\)"):
             served.device().open(5.0, 1)
 
