@@ -263,7 +263,6 @@ class DacDevice(ABC):
 
     def _rates(self, block: int) -> RateLimit:
         """Return the sample rates that it can keep with this block."""
-        del block
         return RateLimit(self._info.max_rate_hz, self._info.rate_note)
 
     @abstractmethod

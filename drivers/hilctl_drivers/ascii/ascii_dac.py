@@ -44,7 +44,6 @@ class AsciiDac(SteppedDac, SerialDac):
         self.unconfirmed = self._unconfirmed()
 
     def _rates(self, block: int) -> RateLimit:
-        del block
         return self._setup.rates(self._setup.after_reading(self._own_time()))
 
     def _own_time(self) -> WireTime:
@@ -58,7 +57,6 @@ class AsciiDac(SteppedDac, SerialDac):
         return wire.then(self._feed_time())
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
-        del block
         self._plan_feeding(sample_rate_hz)
         self._connect()
         # A device that has tripped refuses the steps that follow.
@@ -76,7 +74,6 @@ class AsciiDac(SteppedDac, SerialDac):
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
-        del first_sample
         value = self._chain.output(command.item())
         combined = self._profile.exchange
         if combined != "none" and self._is_combined:

@@ -171,7 +171,6 @@ class FrameFormat:
 
     def split(self, data: Bytes, example: str) -> list[str]:
         """Return the text of a reply."""
-        del example
         return [self.decode(data)]
 
 

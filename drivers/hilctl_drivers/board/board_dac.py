@@ -174,7 +174,6 @@ class BoardSingle(BoardDac):
     """A board that takes one sample per message, paced by this machine."""
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
-        del block
         self._plan_feeding(sample_rate_hz)
         self._connect()
         if self._reader is not None:
@@ -186,7 +185,6 @@ class BoardSingle(BoardDac):
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
-        del first_sample, measured
         # First the reading, which must not show yet what the command does.
         read = None if self._reader is None else self._reader.read()
         found = self._session.exchange(self._chain.output(command))
@@ -233,7 +231,6 @@ class BoardStream(BoardDac):
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
         """Queue a block and wait for the readings of the one that it pushes out."""
-        del measured
         check_next(first_sample, self._next_sample)
         found = self._session.stream(first_sample, self._chain.output(command))
         self._check_answer(found, first_sample)

@@ -274,7 +274,6 @@ def serve(options: EmulatorOptions, on_ready: Callable[[Emulator], None]) -> Non
     emulator = build(options)
 
     def stop(number: int, frame: FrameType | None) -> None:
-        del number, frame
         emulator.server.stop()
 
     gc.collect()

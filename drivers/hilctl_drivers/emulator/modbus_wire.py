@@ -171,7 +171,6 @@ class ModbusWire(EmulatedWire):
 
     def corrupt_at(self, framed: bytes) -> int:
         """Return the byte of a reply whose damage must be detected."""
-        del framed
         return _CORRUPT_AT
 
     def _answered(self, reply: ModbusPDU, request: bytes) -> EmulatedReply:

@@ -91,7 +91,6 @@ class EmulatedText(SerialDevice):
 
     def refusal(self, message: bytes) -> EmulatedReply:
         """Return an answer that refuses the message."""
-        del message
         return self._rejection(_REFUSED)
 
     def _rejection(self, error: str) -> EmulatedReply:

@@ -318,7 +318,6 @@ class ModbusStream(ModbusDevice):
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
         """Queue a block and wait for the readings of the one that it pushes out."""
-        del measured
         stream = self._stream
         if stream is None:
             raise DeviceError("not open")

@@ -51,7 +51,6 @@ class ModbusDac(ModbusDevice):
 
     def _rates(self, block: int) -> RateLimit:
         """Return the rates with the present number of transactions."""
-        del block
         return self._setup.rates(self._wire(self.one_transaction).then(self._feed_time()))
 
     def _open(self, sample_rate_hz: float, block: int) -> None:

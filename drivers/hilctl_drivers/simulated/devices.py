@@ -130,7 +130,6 @@ class SimulatedDevice(DacDevice):
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Put the plant at rest at the present output, with the sample count at 0."""
-        del block
         self._rate_hz, self._digital_readings = sample_rate_hz, 0
         self._plant = self.plant(sample_rate_hz)
         self._next_sample = 0

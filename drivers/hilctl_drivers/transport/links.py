@@ -42,7 +42,6 @@ class Link(Protocol):
 
     def open(self) -> None:
         """Connect; raise LostError if no device answers, or the port is in use."""
-        ...
 
     def transact(
         self, request: bytes | bytearray, missing: Missing, usual: int = 0
@@ -59,15 +58,12 @@ class Link(Protocol):
             LostError: The link is not open, or broke.
             DeviceError: The bytes received are no reply.
         """
-        ...
 
     def doubt(self) -> None:
         """Note a failure: what an older request can still cause must not affect the next one."""
-        ...
 
     def close(self) -> None:
         """Close the link; closing twice is fine."""
-        ...
 
 
 @contextmanager

@@ -45,12 +45,6 @@ def _connected(address: tuple[str, int], timeout_s: float) -> tuple[socket.socke
         raise LostError(f"can't connect: {why(error)}") from None
 
 
-def _reset(connection: socket.socket) -> None:
-    """Close a connection; what the peer has not been given yet must not reach it later."""
-    connection.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
-    connection.close()
-
-
 class _Connection:
     """A TCP connection; ``timeout_s`` is the longest time to connect, and of one exchange."""
 
@@ -70,6 +64,12 @@ class _Connection:
         if self._socket is not None:
             self._socket.close()
             self._socket = None
+
+    def _reset(self) -> None:
+        """Break the connection: what the peer has not been given yet must not reach it later."""
+        if self._socket is not None:
+            self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
+        _Connection.close(self)
 
 
 class TcpLink(_Connection):
@@ -138,11 +138,6 @@ class TcpLink(_Connection):
             reply += data
         return reply
 
-    def _reset(self) -> None:
-        if self._socket is not None:
-            _reset(self._socket)
-            self._socket = None
-
     def doubt(self) -> None:
         """Close the connection: the next one has no late replies."""
         self.close()
@@ -200,7 +195,7 @@ class TcpReceiver(_Connection):
         return received, min(age_ns, time.monotonic_ns() - looked_ns)
 
 
-class TcpStream(StreamLink):
+class TcpStream(_Connection, StreamLink):
     """A TCP connection for text, or to a serial line behind a serial server.
 
     A late reply may still come on the next connection: the server has it from its line.
@@ -211,16 +206,12 @@ class TcpStream(StreamLink):
     def __init__(
         self, host: str, port: int, timeout_s: float, gap_s: float = 0.0, *, echo: bool = False
     ) -> None:
-        super().__init__(gap_s, timeout_s, echo=echo)
-        self._host, self._port = host, port  # a numeric address after connecting
-        self._socket: socket.socket | None = None
+        _Connection.__init__(self, host, port, timeout_s)
+        StreamLink.__init__(self, gap_s, timeout_s, echo=echo)
 
     def open(self, *, boot: bool = True) -> None:
         """Connect, see :meth:`StreamLink.open`."""
-        self.close()
-        made, self._host = _connected((self._host, self._port), self.timeout_s)
-        self._socket = made
-        self._use(made.fileno())  # with its time-out set, Python keeps it non-blocking
+        self._use(self._connect().fileno())  # with its time-out set, Python keeps it non-blocking
         if boot:
             self._stale = True
 
@@ -239,10 +230,8 @@ class TcpStream(StreamLink):
 
     def close(self) -> None:
         """Close the connection; break it if it has failed, so no older request arrives later."""
-        made, self._socket, self._fd = self._socket, None, -1
-        if made is None:
-            return
+        self._fd = -1
         if self._stale:
-            _reset(made)
+            self._reset()
         else:
-            made.close()
+            super().close()
