@@ -41,6 +41,7 @@ class DacDevice(ABC):
 
     Options: ClassVar[type[DeviceOptions]]
     block_max = 1  # samples of one exchange
+    block_note = ""  # reason for that limit, in messages
 
     def __init__(self, info: DeviceInfo, title: str, action: str, output: str) -> None:
         self._curve: tuple[F64, F64] | None = None
@@ -257,10 +258,6 @@ class DacDevice(ABC):
         """Return whether the digital input is high, of a device that has one."""
         raise DeviceError("there is no digital input")
 
-    def _longest_block(self) -> tuple[int, str]:
-        """Return the most samples of an exchange, and the reason as text."""
-        return self.block_max, ""
-
     def _rates(self, block: int) -> RateLimit:
         """Return the sample rates that it can keep with this block."""
         return RateLimit(self._info.max_rate_hz, self._info.rate_note)
@@ -304,10 +301,10 @@ class DacDevice(ABC):
 
     def _check_block(self, block: int) -> None:
         """Raise DeviceError for a block that is too long."""
-        most, why = self._longest_block()
+        most = self.block_max
         if not 1 <= block <= most:
             span = "1 sample" if most == 1 else f"1 to {most} samples"
-            raise DeviceError(f"block must be {span}{why}, got {block}")
+            raise DeviceError(f"block must be {span}{self.block_note}, got {block}")
 
     def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
         """Raise DeviceError for a block that is not as agreed at open."""

@@ -267,10 +267,8 @@ class ModbusStream(ModbusDevice):
         self._sources = [profile.wire_address(cast(ModbusInput, each)) for each in inputs]
         self.fifo_depth = streaming.fifo_depth
         self.block_max = max(1, streaming.fifo_depth // (options.fifo_blocks + 1))
-
-    def _longest_block(self) -> tuple[int, str]:
-        why = f": fifo_blocks + 1 of them must fit into the FIFO, {self.fifo_depth} samples"
-        return self.block_max, why
+        rule = f"fifo_blocks + 1 of them must fit into the FIFO, {self.fifo_depth} samples"
+        self.block_note = f": {rule}"
 
     def _rates(self, block: int) -> RateLimit:
         streaming, settle_s = self._streaming, self._target.settle_s

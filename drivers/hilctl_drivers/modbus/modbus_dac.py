@@ -90,7 +90,8 @@ class ModbusDac(ModbusDevice):
         gain, offset, um_per_unit, offset_um = self._factors
         request = self._encode((command.item() - offset) / gain)
         displacement_um[0] = self._swap(request) * um_per_unit + offset_um
-        self._measure_output(measured)
+        if self._measure is not None:
+            self._measure_output(measured)
         if self._feed_every:
             self._feed()
 

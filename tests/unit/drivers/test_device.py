@@ -16,17 +16,16 @@ INFO = DeviceInfo(
 class NotingDac(DacDevice):
     """Notes what it is asked; fails where it is told to."""
 
+    block_note = ", as its queue holds"
+
     def __init__(self, longest=1):
         super().__init__(INFO, "dac at /dev/x", "exchange", "output AO")
-        self.longest, self.calls, self.broken = longest, [], ""
+        self.block_max, self.calls, self.broken = longest, [], ""
 
     def _note(self, name):
         self.calls.append(name)
         if name == self.broken:
             raise DeviceError("no answer")
-
-    def _longest_block(self):
-        return self.longest, ", as its queue holds"
 
     def _open(self, sample_rate_hz, block):
         self._note("open")
