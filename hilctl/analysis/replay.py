@@ -167,6 +167,7 @@ class _Running:
         self._compensator, self._limiter = _parts_of(first, model)
         # The input of another model is ahead, perhaps in the next piece.
         self._held_back = self._compensator.preview if self._other else 0
+        self._last = first.segments[-1] if first.segments else None
         self._waiting: Samples | None = None
         self._starts: list[ReplayStart] = []
         self._any_start = False
@@ -308,7 +309,7 @@ class _Running:
             self._compensator.begin(samples.reference_um[rest][waveform])
             self._unbegun = False
         # Another model has its own preview.
-        return self._compensator.ahead(samples.reference_um[part])[:]
+        return self._compensator.ahead(samples.reference_um[part], self._last)[:]
 
     def _skipped_on_ramp(self, samples: Samples, row: int) -> int:
         """Return the number of samples of a ramp that were skipped before a row."""

@@ -25,18 +25,22 @@ import numpy as np
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import read_text, write_text
 from hilctl.base.samples import Flag
+from hilctl.base.segments import Segment
 from hilctl.base.strict import Field, StrictModel, ValidationError
 from hilctl.base.types import F64
 from hilctl.experiment.coil_heat import CoilHeat, cooled
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.compensator import Compensator
-from hilctl.models.base import HysteresisModel
+from hilctl.models.base import HysteresisModel, Operator
 from hilctl.recording.metadata_keys import HEAT_FACT
 from hilctl.recording.run_summary import read_ends
 
 _STILL_S = 1.0
 _AT_REST_S = 0.1  # after which the stages of any actuator are at rest
+_FIRST_STEP_UM = 1e-4
+_SETTLED_UM = 1e-9
+_MOST_STEPS = 20
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,11 +79,13 @@ def begin(
     values: F64,
     before: InitialState | None = None,
     begins: str = "at rest",
+    last: Segment | None = None,
 ) -> CompensatorStart:
     """Return input and initial state of a compensator.
 
     ``values``, float64[n], is the reference with correction and lead-in, and ``before`` the state
-    of the actuator (None at rest) with its origin ``begins`` in words.
+    of the actuator (None at rest) with its origin ``begins`` in words. ``last`` is the last
+    waveform, see :meth:`Compensator.ahead`.
 
     Raises:
         ModelError: The model has no inverse.
@@ -90,7 +96,7 @@ def begin(
     compensator.begin(values)
     state = compensator.state()
     return CompensatorStart(
-        input_um=compensator.ahead(values),
+        input_um=compensator.ahead(values, last),
         preview=compensator.preview,
         state_size=state.size,
         state=state if before is not None or compensator.preview else None,
@@ -156,7 +162,33 @@ def left_by(
         forward.stand(more_s)
         inverse.stand(more_s)
         stands_um = float(forward.process(np.array([last]))[0])
+    stands_um = _settle(inverse, stands_um, last, max(round(_AT_REST_S * sample_rate_hz), 1))
     return InitialState(inverse.state(), stands_um, "")
+
+
+def _settle(inverse: Operator, near_um: float, command: float, samples: int) -> float:
+    """Settle an inverse where it holds a command, near a displacement; return its displacement.
+
+    An inverse is inexact at steps of the command, such as those of missing samples. Without this, a
+    run would begin with a step from the command that the actuator is at.
+    """
+    state = inverse.state()
+
+    def off(um: float) -> float:
+        inverse.restore(state)
+        return float(inverse.process(np.full(samples, um))[-1]) - command
+
+    um, step_um = near_um, _FIRST_STEP_UM
+    now = first = off(um)
+    for _ in range(_MOST_STEPS):  # of the secant method
+        um, before, now = um + step_um, now, off(um + step_um)
+        if now == before or abs(step_um) < _SETTLED_UM:
+            break
+        step_um *= now / (before - now)
+    if abs(now) < abs(first):
+        return um
+    inverse.restore(state)
+    return near_um
 
 
 def _and_still(commands: Iterable[F64], samples: int) -> Iterator[F64]:

@@ -196,7 +196,8 @@ def _start(
         # With a soft start of this length, it becomes one from where the actuator stands.
         soft = reference.segments[0].steady_start
         values = before.lead_in(values, max(config.lead_in_samples, soft))
-    begun = begin(loaded.model, config.sample_rate_hz, values, before, begins)
+    last = reference.segments[-1]
+    begun = begin(loaded.model, config.sample_rate_hz, values, before, begins, last)
     if config.zero and loaded.model is None:
         return replace(begun, stands_um=0.0)
     return begun if config.zero or measures_offset(config) else replace(begun, stands_um=None)

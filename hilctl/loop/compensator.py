@@ -1,8 +1,11 @@
 """The compensator: from a reference block to requested commands; owns the hysteresis state."""
 
+import math
+
 import numpy as np
 
 from hilctl.base.errors import ModelError
+from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.models.base import HysteresisModel, Operator
 
@@ -15,11 +18,21 @@ class Compensator:
         self.preview = self._operator.preview if self._operator else 0
         """Samples by which the input leads the commands."""
 
-    def ahead(self, reference: F64) -> F64:
-        """Return a reference, float64[n], shifted by ``preview``; its last value repeats."""
+    def ahead(self, reference: F64, last: Segment | None = None) -> F64:
+        """Return a reference, float64[n], shifted by ``preview``; its last value repeats.
+
+        A periodic ``last`` waveform without a soft end continues instead.
+        """
         if not self.preview:
             return reference
         after = np.repeat(reference[-1:], min(self.preview, reference.size))
+        # The period of a file is not verified.
+        if last and last.period and last.steady_stop == last.stop and last.kind != "file":
+            back = last.period * math.ceil(self.preview / last.period)
+            if back <= min(reference.size, last.stop - last.steady_start):
+                tail = reference[reference.size - math.ceil(back) :]
+                place = tail.size - back + np.arange(self.preview)
+                after = np.interp(place, np.arange(tail.size), tail)
         return np.concatenate((reference[self.preview :], after))
 
     def begin(self, reference: F64) -> None:

@@ -26,7 +26,7 @@ from hilctl.experiment.device_state import (
 )
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
-from hilctl.models.linear_stages import CreepModel
+from hilctl.models.linear_stages import CreepModel, FirstMode
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.encoder import RecordingLayout
@@ -153,6 +153,19 @@ def test_the_output_rests_at_the_safe_value(tmp_path, facts, safe):
     inverse = STAGED.inverse(RATE_HZ)
     inverse.restore(left.state)
     assert inverse.process(np.full(10, left.stands_um))[-1] == pytest.approx(safe, abs=1e-6)
+
+
+@pytest.mark.parametrize("stage", [
+    {"delay_s": 2.4 / RATE_HZ},
+    {"structure": FirstMode(natural_hz=800.0, damping_ratio=0.2)},
+])  # fmt: skip
+def test_the_safe_value_is_held_after_steps_of_the_command(stage):
+    """The inverse of a part of a sample, or of a structure, is inexact at steps."""
+    model = STAGED.model_copy(update=stage)
+    left = left_by([np.repeat(COMMAND[::50], 50), np.zeros(2000)], model, RATE_HZ)
+    inverse = model.inverse(RATE_HZ)
+    inverse.restore(left.state)
+    assert np.abs(inverse.process(np.full(100, left.stands_um))).max() < 1e-9
 
 
 def test_lead_in_of_a_run_that_is_shorter():

@@ -1,9 +1,12 @@
 """The compensator: what it has to be fed, its memory, and what it refuses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hilctl.base.errors import ModelError
+from hilctl.base.segments import Segment
 from hilctl.loop.compensator import Compensator
 from hilctl.models.staged import FieldLag, StagedModel
 from tests.published import terfenol_rdpi
@@ -29,6 +32,23 @@ def test_reference_is_fed_ahead_of_its_time_and_held_at_its_end(size, fed):
     compensator = Compensator(STAGED, RATE_HZ)
     assert compensator.preview == 4
     assert compensator.ahead(np.arange(float(size))).tolist() == fed
+
+
+SINE = Segment("sine", 0, 100, 20, 100, 25.4)
+
+
+@pytest.mark.parametrize(("last", "continues"), [
+    (SINE, True),
+    (replace(SINE, period=3.0), True),
+    (replace(SINE, steady_stop=90), False),
+    (replace(SINE, steady_start=80), False),
+    (replace(SINE, period=0.0), False),
+    (replace(SINE, label="file"), False),
+])  # fmt: skip
+def test_a_periodic_reference_continues_beyond_its_end(last, continues):
+    wave = np.sin(2.0 * np.pi * np.arange(104) / (last.period or SINE.period))
+    fed = Compensator(STAGED, RATE_HZ).ahead(wave[:100], last)
+    assert (np.abs(fed - wave[4:]).max() < 0.01) == continues
 
 
 def test_first_command_belongs_to_what_stood_before():
