@@ -394,7 +394,7 @@ def _smaller(loaded: LoadedExperiment, forecast: Forecast, excess: float) -> str
     if commanded := forecast.command_max - forecast.command_min:
         slope = (forecast.reference_max - forecast.reference_min) / commanded
         amplitude -= _MORE_SLOPE * slope * excess
-    return f"set waveform.amplitude to {amplitude:.3g}" if amplitude > 0.0 else ""
+    return f"set waveform.amplitude to {-_up(-amplitude):g}" if amplitude > 0.0 else ""
 
 
 def _place(

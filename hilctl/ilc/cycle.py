@@ -3,6 +3,7 @@
 import cmath
 import math
 from dataclasses import dataclass
+from pathlib import Path
 
 import numpy as np
 
@@ -65,16 +66,18 @@ class CycleScore:
 def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> CycleScore:
     """Return the error of a segment; raise DataError without motion or two whole steady cycles."""
     part = steady_part(recording, segment)
-    if part.cycle is None or part.cycles < _FEWEST_CYCLES:
+    if part.cycles < _FEWEST_CYCLES:
         rule = f"{segment.label}: needs at least {_FEWEST_CYCLES} whole steady cycles"
         raise DataError(f"{recording.path}: {rule}, got {part.cycles}")
+    if part.cycle is None:
+        raise DataError(f"{recording.path}: {segment.label}: samples are missing in every cycle")
     reference, displacement = part.cycle.signals
     whole = cycle_metrics.peak_to_peak(reference)
     if not (whole > 0.0 and np.ptp(displacement) > 0.0):
         raise DataError(f"{recording.path}: {segment.label}: nothing moved")
     step_hz = recording.sample_rate_hz / segment.period
     count = harmonic_count(segment.period, step_hz, highest_hz)
-    each = _each_cycle(part, segment, count)
+    each = _each_cycle(recording.path, part, segment, count)
     scatter = np.sqrt(np.mean(np.abs(each - each.mean(axis=0)) ** 2, axis=0) / (len(each) - 1))
     strongest_hz, answer = _answer(part, segment, step_hz)
     return CycleScore(
@@ -96,7 +99,7 @@ def harmonic_count(period: float, step_hz: float, highest_hz: float) -> int:
     return max(1, min(int(period / 4.0), int(highest_hz / step_hz), MAX_HARMONICS))
 
 
-def _each_cycle(part: SteadyPart, segment: Segment, count: int) -> C128:
+def _each_cycle(path: Path, part: SteadyPart, segment: Segment, count: int) -> C128:
     """Return the coefficients of the error in each cycle: complex128[cycles, count + 1], in um."""
     samples = part.samples
     since = samples.index - segment.start
@@ -105,7 +108,7 @@ def _each_cycle(part: SteadyPart, segment: Segment, count: int) -> C128:
     rows = [number == k for k in range(part.cycles)]
     whole = [row for row in rows if np.count_nonzero(row) > 0.95 * segment.period]
     if len(whole) < _FEWEST_CYCLES:
-        raise DataError(f"{segment.label}: samples are missing in nearly every cycle")
+        raise DataError(f"{path}: {segment.label}: samples are missing in nearly every cycle")
     return np.array([coefficients(since[r], segment.period, error[r], count) for r in whole])
 
 

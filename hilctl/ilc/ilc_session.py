@@ -219,10 +219,10 @@ class IlcSession:
                     raise
                 self._refusals.append(str(error))
                 self._learning = [refused(each) for each in self._learning]
-                continue
-            rows = self._judge(number, path, learning=True)
-            self._rows += rows
-            on_rows(rows)
+            else:
+                rows = self._judge(number, path, learning=True)
+                self._rows += rows
+                on_rows(rows)
             if all(each.done for each in self._learning):
                 return "; ".join(sorted({each.done for each in self._learning}))
         return f"{cycles} learning cycles are done"

@@ -134,6 +134,8 @@ FULL_GAIN = 0.9
 """Largest share that a step removes."""
 
 _LEAST_GAIN = 0.2
+_LEAST_STEP = 0.01
+"""Smallest gain after refused corrections: those that a limit allows are too small to help."""
 
 AT_FLOOR = 1.2
 """Multiple of the noise floor at which learning ends."""
@@ -221,7 +223,9 @@ def refused(before: IlcState) -> IlcState:
     if before.done or not before.trials:
         return before
     base = before.closest
-    state = _backed_off(before, base)
+    state = replace(_backed_off(before, base), gain=0.5 * before.gain)
+    if state.gain < _LEAST_STEP:
+        return replace(state, done="at a limit", next_um=state.best.correction_um)
     return replace(state, next_um=_moved(state, base))
 
 

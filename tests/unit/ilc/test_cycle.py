@@ -78,6 +78,17 @@ def test_one_cycle_is_not_enough(recording):
         cycle_error(made, made.segments[0], 5000.0)
 
 
+@pytest.mark.parametrize("same_phase", [True, False])
+def test_samples_missing_in_every_cycle_are_told(recording, same_phase):
+    made = recording(100.0, 8, lambda t: 0.2 * np.cos(4.0 * t))
+    segment = made.segments[0]
+    index = made.samples.index
+    keep = (index / segment.period) % 1.0 > 0.3 if same_phase else index % 7 > 0
+    cut = replace(made, samples=made.samples.rows(keep))
+    with pytest.raises(DataError, match="missing"):
+        cycle_error(cut, segment, 5000.0)
+
+
 def test_harmonics_stay_below_what_the_samples_can_show():
     """A quarter of the samples of a period, the highest frequency, or 2000."""
     assert harmonic_count(40.0, 250.0, 1e9) == 10

@@ -161,6 +161,14 @@ def test_a_refused_correction_is_tried_again_with_less():
     assert refused(begun()).gain == FIRST_GAIN
 
 
+def test_learning_ends_at_a_limit():
+    state = learn(begun(), Plant(Response()).run(begun().next_um))
+    for _ in range(10):
+        state = refused(state)
+    assert state.done == "at a limit"
+    assert state.next_um is state.best.correction_um
+
+
 def test_it_gives_up_where_nothing_helps():
     plant = Plant(Response())
     plant._answer = 0.0 * plant._answer
