@@ -165,7 +165,7 @@ def read_catalogue(folder: Path) -> list[Entry]:
     Raise InputError if it is not a folder, or cannot be listed.
     """
     try:
-        folder = folder.resolve()
+        folder = Path(os.path.realpath(folder))  # resolve() raises RuntimeError for cyclic links
         with os.scandir(folder):
             pass
     except OSError as error:

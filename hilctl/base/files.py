@@ -3,6 +3,7 @@
 import errno
 import os
 import secrets
+import stat
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import contextmanager, suppress
 from pathlib import Path
@@ -68,6 +69,14 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
         raise InputError(f"{path}: can't be read: {why}") from None
 
 
+def open_binary(path: Path, buffering: int = -1) -> BinaryIO:
+    """Open a file for reading; raise OSError if it is a pipe (which would wait) or a device."""
+    mode = path.stat().st_mode
+    if not (stat.S_ISREG(mode) or stat.S_ISDIR(mode)):
+        raise OSError(errno.EINVAL, "Not a regular file", str(path))
+    return path.open("rb", buffering)
+
+
 def sync_folder(path: Path) -> None:
     """Flush a folder to the disk, so that the name of a new file survives a power cut."""
     try:
@@ -100,7 +109,7 @@ class AtomicFile:
 
     def __init__(self, path: Path, *, overwrite: bool) -> None:
         self._overwrite = overwrite
-        self.final = path.resolve() if overwrite else path
+        self.final = Path(os.path.realpath(path)) if overwrite else path
         if not overwrite and os.path.lexists(path):
             raise FileExistsError(errno.EEXIST, os.strerror(errno.EEXIST), str(path))
         if self.final.exists() and not self.final.is_file():  # a rename would replace /dev/null
@@ -269,6 +278,8 @@ def no_such_file(path: Path) -> str:
     """Return the message for a missing file, with the closest existing name."""
     if not path.parent.is_dir():
         return f"{path}: no such file (there is no folder {path.parent})"
+    if path.is_symlink():
+        return f"{path}: no such file (it is a link to {path.readlink()})"
     try:
         names = [] if path.exists() else [each.name for each in path.parent.iterdir()]
     except OSError:

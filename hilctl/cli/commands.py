@@ -4,6 +4,7 @@ The table allows a command of ``hilctl_drivers``, which ``hilctl`` never imports
 """
 
 import ast
+import sys
 from functools import cache
 from importlib import import_module
 from importlib.util import find_spec
@@ -16,7 +17,7 @@ from typer.core import TyperCommand, TyperGroup
 from hilctl import __version__
 from hilctl.base.errors import InputError, RunError
 from hilctl.cli import LINUX_MODULES, system_error_text
-from hilctl.cli.output import QUIET, VERBOSE
+from hilctl.cli.output import QUIET, VERBOSE, print_json
 
 _MODULES = {
     "hilctl.cli.experiments": ("demo", "examples", "init", "schema"),
@@ -90,6 +91,10 @@ class CommandTable(TyperGroup):
             return super().invoke(ctx)
         except EOFError as error:
             raise RunError(system_error_text(error)) from error
+        except Exception as error:
+            if "--json" in sys.argv and hasattr(error, "format_message"):  # typer prints text only
+                print_json({"error": error.format_message(), "problems": []})
+            raise
 
 
 def load(name: str) -> Any:

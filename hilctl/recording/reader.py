@@ -16,7 +16,7 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata
 from hilctl.base.device import AuxChannel
 from hilctl.base.errors import DataError
 from hilctl.base.events import Event
-from hilctl.base.files import no_such_file, reason
+from hilctl.base.files import no_such_file, open_binary, reason
 from hilctl.base.samples import COLUMNS, LAST_SAMPLE, Samples
 from hilctl.base.types import F64, I64, U32, CommandUnit
 from hilctl.recording.codec import BlockArrays
@@ -329,7 +329,7 @@ def _read(
 ) -> Generator[Recording, None, None]:
     """Yield pieces of at least that many samples, uncut; one piece if None."""
     try:
-        with path.open("rb") as stream:
+        with open_binary(path) as stream:
             places = places_of(stream, stretch) if stretch else None
             scan = RecoveryScan(stream)
             builder = RecordingBuilder(scan, stretch)

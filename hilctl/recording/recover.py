@@ -16,6 +16,7 @@ from mcap.records import Attachment, Channel, McapRecord, Message, Metadata, Sch
 from hilctl import __version__
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
+from hilctl.base.files import open_binary, reason
 from hilctl.base.private_dirs import HAS_LOCKS
 from hilctl.base.samples import LAST_SAMPLE, BlockBatch, BlockHeader
 from hilctl.recording.encoder import MessageMaker, RecordingLayout, Topics, event_message
@@ -259,7 +260,7 @@ def recover_recording(
         InputError: It is being recorded, or the new file cannot be written. Nothing has changed.
     """
     try:
-        with path.open("rb") as stream:
+        with open_binary(path) as stream:
             lock(stream, shared=True)
             survey = Survey(stream)
             more = list(_not_in_file(extra, survey.next_sample))
@@ -276,7 +277,7 @@ def recover_recording(
                 saved.copy(RecoveryScan(stream, MessageValidator()).records())
                 if layout:
                     saved.add(more, events, layout)
-                reason = saved.finish(end, ended_at if ended_at < LAST_SAMPLE else 0)
+                ended = saved.finish(end, ended_at if ended_at < LAST_SAMPLE else 0)
                 if not HAS_LOCKS:
                     stream.close()
                 kept = replacement.put()
@@ -288,11 +289,11 @@ def recover_recording(
         raise InputError(f"{output}: exists already: give another --output") from None
     except OSError as error:
         where = error.filename or path
-        raise InputError(f"{where}: can't be recovered: {error.strerror}") from None
+        raise InputError(f"{where}: can't be recovered: {reason(error)}") from None
     return Recovered(
         path=replacement.final,
         original=kept,
-        reason=reason,
+        reason=ended,
         samples=saved.samples,
         added_samples=saved.added,
         missing_samples=saved.missing,

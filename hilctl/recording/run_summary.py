@@ -1,7 +1,6 @@
 """Facts of a run from both ends of its file, without reading samples."""
 
 import os
-import stat
 from collections.abc import Mapping
 from dataclasses import dataclass
 from itertools import islice
@@ -13,7 +12,7 @@ from mcap.records import Metadata, MetadataIndex, SummaryOffset
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
-from hilctl.base.files import reason
+from hilctl.base.files import open_binary, reason
 from hilctl.recording.mcap_records import footer_of, records_from
 from hilctl.recording.metadata_keys import CHECKSUM_FACT, unsealed
 from hilctl.recording.recording_files import is_being_recorded
@@ -47,14 +46,12 @@ def recordings_in(folder: Path) -> list[Path]:
 def read_ends(path: Path) -> RunSummary:
     """Read the facts of a run from both ends of its recording; raise DataError if it has none."""
     try:
-        if stat.S_ISREG(path.stat().st_mode):  # first: opening a pipe waits for its writer
-            with path.open("rb", _BUFFER_BYTES) as stream:
-                return _ends(stream)
+        with open_binary(path, _BUFFER_BYTES) as stream:
+            return _ends(stream)
     except OSError as error:
         raise DataError(f"{path}: can't be read: {reason(error)}") from None
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
-    raise DataError(f"{path}: is not a file")
 
 
 def _ends(stream: BinaryIO) -> RunSummary:

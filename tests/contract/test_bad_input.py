@@ -242,6 +242,7 @@ def test_folder_for_recordings(refused):
 def test_recording_to_read(refused, place, words):
     (place / "folder.mcap").mkdir()
     (place / "text.mcap").write_text("no recording")
+    os.mkfifo(place / "pipe.mcap")
     folder = "can't be read: Is a directory"
     if words == "report {}":  # a folder stands for all of its recordings
         folder = "contains no recordings"
@@ -249,6 +250,7 @@ def test_recording_to_read(refused, place, words):
         ("lost.mcap", "lost.mcap: no such file"),
         ("folder.mcap", f"folder.mcap: {folder}"),
         ("text.mcap", "text.mcap: is not an MCAP file"),
+        ("pipe.mcap", "pipe.mcap: can't be read: Not a regular file"),
     ]:
         refused(message, *words.format(name).split())
 
@@ -259,9 +261,10 @@ def test_schema(refused):
 
 
 def test_unknown_option(hilctl, place):
-    ended = hilctl("run", "--speed", "11")
+    ended = hilctl("run", "--speed", "11", "--json")
     assert ended.code == 2
     assert "--speed" in ended.err
+    assert "--speed" in json.loads(ended.out)["error"]
     assert "Traceback" not in ended.err
     assert contents(place) == {}
 

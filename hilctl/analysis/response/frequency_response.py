@@ -250,6 +250,8 @@ def _columns(recording: Recording, signals: Signals) -> list[str]:
     """Return the columns of input and output."""
     units = {"displacement": "_um", "reference": "_um", "input": "_um"}
     columns = [f"{each}{units.get(each, '')}" for each in signals.split("-")]
+    if not recording.samples.index.size:
+        raise DataError(f"{recording.path}: holds no sample")
     for name in columns:
         if not np.isfinite(recording.samples.column(name)).any():
             raise InputError(f"{recording.path}: {name} is not recorded: use other --signals")

@@ -283,7 +283,9 @@ def history_from_pieces(pieces: Iterable[Recording]) -> History:
             f"{piece.path}: begins with a ramp, so the actuator was not at rest. Omit --whole to "
             "use its steady cycles"
         )
-    if lost or next_sample == begins_at:
+    if next_sample == begins_at:
+        raise DataError(f"{piece.path}: holds no sample of the waveform")
+    if lost:
         raise DataError(
             f"{piece.path}: samples are missing whose command is unknown, so it can't be fitted as "
             "a whole. Omit --whole to use its steady cycles"

@@ -63,7 +63,7 @@ def test_what_can_not_be_read_is_listed_and_listed(folder):
         **dict.fromkeys(["text.mcap", "pipe.mcap", "link.mcap", r"\xff\xfe.mcap"], "unreadable"),
         "torn.mcap": "recording",
     }
-    assert "not a file" in problems["pipe.mcap"]
+    assert "Not a regular file" in problems["pipe.mcap"]
     assert "No such file" in problems["link.mcap"]
     assert states_of(read_catalogue(folder))["torn.mcap"] == "unfinished"
     torn.write_bytes(whole)
@@ -166,7 +166,8 @@ def test_a_label_without_recordings_is_a_warning(caplog):
 
 def test_a_folder_that_cannot_be_listed_is_an_input_error(tmp_path):
     (tmp_path / "file").write_text("")
-    for name in ("none", "file"):
+    (tmp_path / "loop").symlink_to("loop")
+    for name in ("none", "file", "loop"):
         with pytest.raises(InputError, match=f"{name}: .*listed"):
             read_catalogue(tmp_path / name)
     assert len(read_catalogue(tmp_path)) == 0

@@ -238,5 +238,7 @@ def test_the_file_that_is_likely_to_be_meant(tmp_path):
         "terfenol_sine.yaml: no such file (did you mean 'terfenol_sine_6a.yaml'?)"
     )
     assert no_such_file(tmp_path / "other.csv").endswith("other.csv: no such file")
+    (tmp_path / "link.csv").symlink_to("gone.csv")
+    assert no_such_file(tmp_path / "link.csv").endswith("(it is a link to gone.csv)")
     lost = no_such_file(tmp_path / "lost" / "x.yaml")
     assert lost.endswith(f"(there is no folder {tmp_path / 'lost'})")
