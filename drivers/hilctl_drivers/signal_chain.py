@@ -12,7 +12,7 @@ from ipaddress import ip_address
 from typing import Annotated, Literal, Self, TypeAlias, TypeVar
 
 import numpy as np
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, field_validator, model_validator
 
 from hilctl.base.calibration import AmplifierCalibration, NamedCalibration
 from hilctl.base.device import DeviceOptions
@@ -274,6 +274,13 @@ class AuxInput(DeviceOptions):
     scale: float = Field(default=1.0, description="value per unit of the input")
     offset: float = Field(default=0.0, description="value at input 0")
     meaning: str = Field(default="", description="comment, kept with each recording")
+
+    @field_validator("scale")
+    @classmethod
+    def _follows(cls, scale: float) -> float:
+        if scale == 0.0:
+            raise ValueError("must not be 0, because no limit would trip")
+        return scale
 
 
 class DacOptions(AddressOptions):

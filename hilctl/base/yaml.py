@@ -269,7 +269,8 @@ def _choices(annotation: Any) -> list[Any]:
     if origin is Annotated:
         return _choices(typing.get_args(annotation)[0])
     if origin in {typing.Union, types.UnionType}:
-        return [each for each in typing.get_args(annotation) if each is not type(None)]
+        members = [each for each in typing.get_args(annotation) if each is not type(None)]
+        return [choice for each in members for choice in _choices(each)]
     return [annotation]
 
 

@@ -14,6 +14,7 @@ from hilctl.base.types import F64
 from hilctl.experiment.file import REST_S, Experiment
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.loop.lead_in import Conditioning
+from hilctl.waveforms.shapes import check_length
 
 OFFSET_SHARE = 0.25  # largest measured offset that is corrected, as a share of the stroke limits
 _HIGHEST_HZ = 10.0  # slow enough for fields to penetrate a rod
@@ -29,7 +30,7 @@ def measures_offset(config: Experiment) -> bool:
 def conditioning_of(
     loaded: LoadedExperiment, stands_um: float | None = None
 ) -> Conditioning | None:
-    """Return the conditioning before the waveform, or None."""
+    """Return the conditioning before the waveform, or None; raise InputError if it is too long."""
     # stands_um: the model displacement at its end, or None if no offset is measured.
     config, condition = loaded.config, loaded.config.condition
     if condition is None and not config.zero and not measures_offset(config):
@@ -103,6 +104,7 @@ def _cycle(config: Experiment) -> F64:
     assert condition is not None
     below, above = _room(config)
     cycles_per_sample = _frequency_hz(config) / config.sample_rate_hz
+    check_length(condition.cycles / cycles_per_sample)
     turn = cycles_per_sample * np.arange(1, round(condition.cycles / cycles_per_sample) + 1)
     wave = np.sin(2.0 * np.pi * turn)
     falling, span, decay = np.maximum(turn - 1.0, 0.0), condition.cycles - 1.0, condition.decay

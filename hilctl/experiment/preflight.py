@@ -106,7 +106,10 @@ def check(
     """
     config, model = loaded.config, loaded.model
     problems = [*device_problems(loaded), *condition_problems(loaded)]
-    conditioning = conditioning_of(loaded)
+    try:
+        conditioning = conditioning_of(loaded)
+    except InputError as error:
+        raise ConfigError([*problems, loaded.problem("condition", str(error))]) from None
     conditioned = np.empty(0) if conditioning is None else conditioning.command
     rest = config.safe.value
     if model is not None:

@@ -90,8 +90,13 @@ def fit_sensor(name: str, reading: F64, true: F64, origin: Origin) -> Calibratio
     """Fit the curve of a sensor: the lowest order that the noise supports, or else a table.
 
     Readings rise; both are float64[n], in um. ``name`` is that of the data in messages. Raise
-    DataError if the fitted displacement does not rise with the reading.
+    DataError if the fitted displacement does not rise with the reading, or not as far.
     """
+    ratio = float(np.ptp(true) / np.ptp(reading))
+    if not 0.5 <= ratio <= 2.0:
+        rule = f"the true displacement spans {ratio:.3g} times the readings, instead of 0.5 to 2"
+        hint = "check the columns, use um for both, or correct device.sensor"
+        raise DataError(f"{name}: {rule}: {hint}")
     fits = [
         _polynomial(reading, true, order)
         for order in range(1, min(_HIGHEST_ORDER, np.unique(reading).size - 2) + 1)

@@ -260,7 +260,7 @@ def assigned(assignments: Sequence[str]) -> dict[str, Any]:
         if key == "inverse" and value not in {"in", "out"}:
             raise InputError(f"inverse must be in or out: {value!r}")
         try:
-            wanted[key] = value if key == "inverse" else float(value)
+            wanted[key] = value if key == "inverse" else float(value.replace("_", " "))
         except ValueError:
             raise InputError(f"{key} must be a number: {value!r}") from None
     return wanted

@@ -4,7 +4,7 @@ from collections.abc import Mapping
 from typing import Annotated, Literal
 
 import pytest
-from pydantic import BaseModel, ConfigDict, Field, field_validator, model_validator
+from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.strict import StrictModel
@@ -386,12 +386,25 @@ class Guard(StrictModel):
         return self
 
 
+class Sine(StrictModel):
+    kind: Literal["sine"]
+    height: float
+
+
+class Step(StrictModel):
+    kind: Literal["step"]
+
+
+Checked = AfterValidator(lambda value: value)
+
+
 class Several(StrictModel):
     guard: Guard | Literal["none"] = "none"
     base: Literal[0, 1, "modicon"] | None = None
     end: Literal["\r", "\n"] = "\n"
     level: float | Literal["safe"] = 0.0
     guards: Mapping[str, Guard | Literal["none"]] = Field(default_factory=dict)
+    wave: Annotated[Annotated[Sine | Step, Field(discriminator="kind")], Checked] | None = None
     span: tuple[float, Annotated[int, Field(ge=0)]] = (0.0, 0)
     names: dict[Annotated[str, Field(pattern="^[a-z]+$")], float] = Field(default_factory=dict)
 
@@ -422,6 +435,7 @@ class Several(StrictModel):
     ("span: [x, -1]",
      ["x:1: span.0: must be a number, got 'x'",
       "x:1: span.1: must be >= 0, got -1"]),
+    ("wave: {kind: sine}", ["x:1: wave.height: is required"]),
     ("names: {A1: 1.0}",
      ["x:1: names.A1: string should match pattern '^[a-z]+$', got 'A1'"]),
 ])  # fmt: skip

@@ -200,6 +200,12 @@ def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a)
     assert np.isfinite(displacement_um).all()
 
 
+def test_a_channel_that_would_never_change_is_refused(rig):
+    aux = {"coil_a": {"input": "current", "scale": 0.0}}
+    with pytest.raises(ValueError, match=r"aux\.coil_a\.scale"):
+        rig("kepco_bop", reader="agilent_34970a", own_line=True, aux=aux)
+
+
 def test_auxiliary_channels_of_either_device(rig):
     aux = {"sensor_v": {"input": "AI101"}, "coil_a": {"input": "current", "scale": -1.0}}
     bench = rig("kepco_bop", reader="agilent_34970a", own_line=True, aux=aux)

@@ -50,6 +50,11 @@ def command_of(*given, text=EXPERIMENT):
     return made.command[: made.cycle_samples], made
 
 
+def test_a_cycle_beyond_the_memory_is_refused():
+    with pytest.raises(ConfigError, match=r"condition: has .* samples"):
+        check(loaded("condition.frequency_hz=1e-9"))
+
+
 class TestCycle:
     def test_from_the_limits(self):
         """By itself it goes to the limits at 10 Hz, 20 times, ever less far, and rests 0.1 s."""

@@ -78,9 +78,10 @@ def test_a_table_where_no_polynomial_fits():
     assert max(errors(fit, waved)) < 0.1
 
 
-def test_a_falling_curve_is_refused():
+@pytest.mark.parametrize("factor", [-1.0, 0.4, 1000.0])
+def test_a_falling_curve_and_another_unit_are_refused(factor):
     with pytest.raises(DataError, match=r"device\.sensor"):
-        fit_sensor("pairs", TRUE, -TRUE, ORIGIN)
+        fit_sensor("pairs", TRUE, factor * TRUE, ORIGIN)
 
 
 def test_units_of_columns_are_converted(tmp_path):

@@ -138,6 +138,7 @@ def test_mark_sends_its_text(answers):
     ("gain", "must be gain=NUMBER, offset=NUMBER or inverse=in.out: 'gain'"),
     ("rate=1", "must be gain=NUMBER"),
     ("gain=high", "gain must be a number: 'high'"),
+    ("gain=1_0", "gain must be a number: '1_0'"),
     ("inverse=0", "inverse must be in or out: '0'"),
 ])  # fmt: skip
 def test_what_is_no_setting_is_refused(text, said):
