@@ -68,7 +68,9 @@ def export(
     def write(stream: BinaryIO) -> None:
         nonlocal rows
         # On the same file system.
-        with TemporaryDirectory(dir=path.parent, ignore_cleanup_errors=True) as aside:
+        with TemporaryDirectory(
+            prefix=".hilctl-", dir=path.parent, ignore_cleanup_errors=True
+        ) as aside:
             rows = write_pieces(pieces, begin(stream, Path(aside)))
 
     write_file(path, write, overwrite=overwrite)

@@ -174,7 +174,7 @@ class _StoredColumns:
         for name, values in columns.items():
             self._kinds[name] = values.dtype
             with (self._aside / name).open("ab") as file:
-                values.tofile(file)
+                file.write(np.ascontiguousarray(values).data)  # tofile() hides the errno
         self._rows += next(iter(columns.values())).size
 
     def _joined(self) -> dict[str, Any]:
