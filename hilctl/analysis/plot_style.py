@@ -117,7 +117,9 @@ def _band(axes: Axes, t: F64, low: F64, high: F64, colour: str, label: str, outl
 def draw_line(
     axes: Axes, t: F64, values: F64, colour: str, label: str = "", *, dashed: bool = False
 ) -> None:
-    """Draw a signal as a line of at most :data:`MAX_POINTS` points."""
+    """Draw a signal as a line of at most :data:`MAX_POINTS` points; without any value, nothing."""
+    if not np.isfinite(values).any():
+        return
     width, style = (0.9, "--") if dashed else (1.5, "-")
     name = label or "_unnamed"  # matplotlib leaves labels with an underscore out of legends
     axes.plot(*min_max(t, values), color=colour, linestyle=style, linewidth=width, label=name)

@@ -103,7 +103,7 @@ def time_history(recording: Recording) -> FigureSpec | None:
         axes.set(xlabel="time, s", ylabel=f"command, {recording.command_unit}")
         _mark_judged(axes, recording)
 
-    caption = "Whole run: displacement, reference and command; grey: the evaluated part."
+    caption = "Whole run; grey: the evaluated part."
     panels = Panel(moved), Panel(commanded, height=_LOW)
     return FigureSpec("history", caption, panels, stacked=True)
 

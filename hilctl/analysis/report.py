@@ -254,6 +254,7 @@ def _worst(segments: Sequence[SegmentReport]) -> dict[str, Any]:
     figures["sensor_noise_um"] = _pooled_noise_um(segments)
     figures["steady_cycles"] = sum(each.steady_cycles for each in segments)
     figures["steady_samples"] = sum(each.steady_samples for each in segments)
+    figures["settled"] = all(each.settled for each in segments)
     return figures
 
 
@@ -327,6 +328,7 @@ class SegmentReportBuilder:
             samples=self._samples,
             steady_cycles=self._cycles,
             steady_samples=self._steady,
+            settled=self._start - self._segment.steady_start >= period - 1.0,
             sensor_noise_um=noise_um,
             **{name: found.get(name) for name in (*_WORST, "noise_floor_percent")},
         )

@@ -34,6 +34,8 @@ class RunMetrics:
         sensor_noise_um: Estimated rms noise of a single displacement sample.
         steady_cycles: Evaluated whole cycles.
         steady_samples: Evaluated samples.
+        settled: Whether no evaluated cycle is the first at full amplitude, whose hysteresis depends
+            on the motion before it.
     """
 
     peak_hysteresis_percent: float | None
@@ -47,6 +49,7 @@ class RunMetrics:
     sensor_noise_um: float | None
     steady_cycles: int
     steady_samples: int
+    settled: bool
 
 
 @dataclass(frozen=True, slots=True)
@@ -232,8 +235,12 @@ def quality_rows(report: RunReport) -> list[tuple[str, str]]:
         ("sensor noise", report.sensor_noise_um, "um", " rms"),
     ]
     known = [(name, number(v, unit) + more) for name, v, unit, more in rows if v is not None]
-    counts = ("steady cycles", report.steady_cycles), ("evaluated samples", report.steady_samples)
-    return [*known, *((name, f"{count:,}") for name, count in counts if count)]
+    first = "" if report.settled else " (the first depends on the motion before it: record more)"
+    counts = (
+        ("steady cycles", report.steady_cycles, first),
+        ("evaluated samples", report.steady_samples, ""),
+    )
+    return [*known, *((name, f"{count:,}{more}") for name, count, more in counts if count)]
 
 
 def segment_table(report: RunReport) -> tuple[list[str], list[list[str]]]:

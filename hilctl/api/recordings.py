@@ -140,7 +140,7 @@ def export(
 def list_runs(
     folder: PathLike = ".", where: str = "", sort: str = "started", *, reverse: bool = False
 ) -> RunTable:
-    """Return the metadata of all recordings in a folder and its subfolders.
+    """Return the metadata of all recordings in a folder and below, with paths relative to it.
 
     Args:
         folder: The folder.

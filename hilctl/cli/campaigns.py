@@ -223,13 +223,15 @@ def _steps(plan: CampaignPlan, varied: Sequence[VariedParameter]) -> Table:
             *(_shown(_values(each.step).get(parameter.key)) for parameter in varied),
             f"{each.seconds:.1f}" if each.kept is None else "",
             f"{each.pause_s:.0f}" if each.pause_s else "",
-            f"{each.heat_a2**0.5:.2f}" if each.kept is None else "",
+            f"{each.heat_a2**0.5:.2f}" if each.kept is None and each.heat_a2 else "",
             "done earlier" if each.kept else "reference run" if each.step.is_reference else "",
         )
         for each in plan.steps
     ]
     axes = (parameter.axis for parameter in varied)
     headings = ("step", *axes, "s", "pause s", "coil A rms", "")
+    columns = [each for each in zip(headings, *rows, strict=True) if any(each[1:])]
+    headings, *rows = zip(*columns, strict=True)
     return table(f"{plan.campaign.config.name}: steps", headings, rows, wrap=True)
 
 

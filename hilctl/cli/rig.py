@@ -174,7 +174,7 @@ def _finish(result: Characterisation, output: Path, folder: Path, *, as_json: bo
     )
     if result.problem:
         print(f"hilctl: {result.problem}", file=sys.stderr)
-        hint = "fix this, then use --overwrite to measure again (see the page for results)"
+        hint = "fix this, then use --overwrite, or delete the last recording to repeat its step"
         print(f"hilctl: {hint}", file=sys.stderr)
         raise typer.Exit(3)
     if not result.is_model:

@@ -102,8 +102,12 @@ def run_facts(
 
 
 def experiment_sha256(loaded: "LoadedExperiment") -> str:
-    """Return the SHA-256 of an experiment without its labels; it identifies completed runs."""
+    """Return the SHA-256 of an experiment without its labels and its device's timeout.
+
+    It identifies completed runs, which neither of them changes.
+    """
     data = {key: value for key, value in loaded.document.data.items() if key != LABELS_FACT}
+    data["device"] = {key: value for key, value in data["device"].items() if key != "timeout_s"}
     return sha256_of(dump(data))
 
 

@@ -135,7 +135,8 @@ def small_signal(recording: Recording) -> FrequencyResponse:
         remedy = "find what else moves the sensor, or widen the limits"
         raise RigProblemError("noise", f"small-signal response: {error}", remedy) from None
     except DataError as error:
-        raise RigProblemError("no_reading", str(error), "then run it again") from None
+        remedy = "on a busy computer, lower sample_rate_hz"
+        raise RigProblemError("no_reading", str(error), remedy) from None
 
 
 _FEWEST_STEPS = 500  # distinct readings in a motion, for equal readings to mean saturation

@@ -54,6 +54,12 @@ class TestTimeHistory:
                 for line in axes.get_lines():
                     assert line.get_xdata().size <= plot_style.MAX_POINTS
 
+    def test_run_without_a_reference_has_no_line_of_it(self, run) -> None:
+        assert "reference" in lines(drawn(plots.steady_cycles(run())).axes[0])
+        assert [*lines(drawn(plots.steady_cycles(run(compensated=False))).axes[0])] == [
+            "displacement"
+        ]
+
     def test_last_steady_cycles_stand_beside(self, run) -> None:
         close = drawn(plots.steady_cycles(run())).axes[0]
         start, stop = close.get_lines()[0].get_xdata()[[0, -1]]

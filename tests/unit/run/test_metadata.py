@@ -76,6 +76,15 @@ def test_labels_are_recorded_and_change_no_identity():
 CONFIGS = Path(__file__).parents[3] / "configs"
 
 
+def test_timeout_of_the_device_changes_no_identity():
+    loaded = [
+        checked_experiment(CONFIGS / "modbus_labjack_t7.yaml", settings).loaded
+        for settings in ([], ["device.timeout_s=1.0"], ["device.tcp_port=503"])
+    ]
+    first, patient, elsewhere = map(experiment_sha256, loaded)
+    assert first == patient != elsewhere
+
+
 def test_profiles_have_hashes():
     checked = checked_experiment(CONFIGS / "modbus_adam_6224.yaml", [])
     facts = run_facts(checked, "2000-01-01T00:00:00", "")
