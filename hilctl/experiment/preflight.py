@@ -49,6 +49,7 @@ _log = logging.getLogger(__name__)
 
 _MANY = 50_000_000  # samples, which take some seconds
 _ROUNDING = 1e-9  # of the range of commands
+_INEXACT = 2e-3  # the same, of an inverse after the corners of a ramp
 _MORE_SLOPE = 1.5  # of a loop at its ends, than on average
 _SOFT_SHARE = 0.25  # of the slew limit, for a soft start
 _SLOWER = "lower frequency or amplitude, soften jumps (soft_start_s, soft_end_s, rise_s)"
@@ -133,6 +134,7 @@ def check(
     except ModelError as error:
         raise ConfigError([*problems, loaded.problem("compensator.model", str(error))]) from None
     problems += _mark_problems(loaded, reference)
+    problems += _lead_in_problems(loaded, reference.values, begun.input_um)
     problems += feedback_problems(loaded, begun.preview)
     problems += adaptation_problems(loaded, begun.preview)
     warnings = findings.warnings + adaptation_warnings(config, reference.segments)
@@ -258,6 +260,23 @@ def _start_problems(
     return [loaded.problem("waveform", rule, value, hint)]
 
 
+def _lead_in_problems(
+    loaded: LoadedExperiment, reference_um: F64, input_um: F64
+) -> list[ConfigProblem]:
+    """Return that the lead-in from the initial displacement would trip on the tracking error."""
+    config, limits = loaded.config, loaded.config.interlocks
+    if loaded.model is None or limits.tracking_error_um is None:
+        return []
+    apart_um = np.abs(reference_um - input_um)[: config.lead_in_samples]
+    samples = (limits.tracking_s or 0.0) * config.sample_rate_hz
+    if not np.count_nonzero(apart_um > limits.tracking_error_um) > samples:
+        return []
+    rule = f"must be at most {limits.tracking_error_um:g} µm from the reference at the start"
+    hint = "the tracking error would end the run: set waveform.soft_start_s, or begin the reference"
+    value = f"{apart_um[0]:.4g} µm"
+    return [loaded.problem("waveform", f"the actuator {rule}", value, f"{hint} near its rest")]
+
+
 def reference_problems(
     loaded: LoadedExperiment, unit: str, low: float, high: float
 ) -> list[ConfigProblem]:
@@ -296,7 +315,7 @@ def command_problems(
 ) -> list[ConfigProblem]:
     """Return the limits that the commands of a forecast exceed, by how much, and when.
 
-    An excess below a step of the output is none: the limiter takes it away.
+    The limiter clamps a smaller excess than :func:`_tolerated`.
     """
     limits = loaded.config.limits
     low, high = limits.command_range
@@ -306,7 +325,7 @@ def command_problems(
         rule = "every command must be a finite number"
         return [loaded.problem("compensator.model", rule, span)]
     found = []
-    if (excess := _excess(loaded, forecast)) > loaded.device.info.command_step:
+    if (excess := _excess(loaded, forecast)) > _tolerated(loaded):
         key = f"limits.{limits.range_key}"
         below = low - forecast.command_min == excess
         at_s = forecast.lowest_at_s if below else forecast.highest_at_s
@@ -382,12 +401,19 @@ def _excess(loaded: LoadedExperiment, forecast: Forecast) -> float:
     return excess if excess > _ROUNDING * (high - low) else 0.0
 
 
+def _tolerated(loaded: LoadedExperiment) -> float:
+    """Return the excess that is no error: a step of the output, or the accuracy of an inverse."""
+    low, high = loaded.config.limits.command_range
+    inexact = 0.0 if loaded.model is None else _INEXACT * (high - low)
+    return max(loaded.device.info.command_step, inexact)
+
+
 def _clamped(loaded: LoadedExperiment, forecast: Forecast) -> Iterator[str]:
-    limits, step = loaded.config.limits, loaded.device.info.command_step
+    limits = loaded.config.limits
     if excess := _excess(loaded, forecast):
         yield (
             f"limits.{limits.range_key}: commands exceed it by {excess:.2g} {limits.unit}, less "
-            f"than a step of the output, {step:.2g} {limits.unit}: the limiter clamps them"
+            f"than {_tolerated(loaded):.2g} {limits.unit}: the limiter clamps them"
         )
 
 

@@ -40,8 +40,9 @@ def loops_sheet(caption: str, loops: Sequence[LoopFigures], unit: str) -> Figure
     def draw(axes: Axes) -> None:
         for loop, colour in zip(loops, cycle(NAMED), strict=False):
             around = (np.append(each, each[0]) for each in (loop.command, loop.displacement_um))
-            at = f"{loop.bias:+.2g} " if abs(loop.bias) > 0.05 * loop.amplitude else ""
-            label = f"{at}{loop.amplitude:.3g} {unit}, {loop.frequency_hz:g} Hz"
+            biased = abs(loop.bias) > 0.05 * loop.amplitude
+            at = f" about {loop.bias:.3g}" if biased else ""
+            label = f"{loop.amplitude:.3g}{at} {unit}, {loop.frequency_hz:g} Hz"
             axes.plot(*around, color=colour, linewidth=0.9, label=label)
         axes.set(xlabel=f"command, {unit}", ylabel="displacement, µm")
 

@@ -474,12 +474,17 @@ def test_an_exceeded_limit_is_named_with_time_part_and_a_cure(setting, at_s, par
     assert checked(PIEZO, *given, *(f"{key}={value}" for key in keys), model=STAGE, **wide)
 
 
-def test_an_excess_below_a_step_of_the_output_is_clamped_and_said():
-    given = ("waveform.rest=0.0058",)
-    found = checked(PIEZO, *given, model=STAGE, **VOLTS)
-    assert -1.5e-3 < found.forecast.command_min < 0.0
+@pytest.mark.parametrize(("rest_um", "step_v"), [(0.0058, 0.0), (-0.1, 1.0)])
+def test_a_small_excess_is_clamped_and_said(rest_um, step_v):
+    """Smaller than the error of an inverse, or than a step of the output."""
+    given = (f"waveform.rest={rest_um}",)
+    found = checked(PIEZO, *given, model=STAGE, **VOLTS | {"command_step": step_v})
+    assert -1.0 < found.forecast.command_min < 0.0
     assert any("limits.drive_v" in each for each in found.warnings)
-    (problem,) = refusals(PIEZO, *given, model=STAGE, **VOLTS | {"command_step": 0.0})
+
+
+def test_a_larger_excess_than_the_error_of_an_inverse_is_refused():
+    (problem,) = refusals(PIEZO, "waveform.rest=-0.1", model=STAGE, **VOLTS)
     assert problem.key == "limits.drive_v"
 
 
@@ -493,6 +498,16 @@ def test_a_soft_start_begins_where_the_last_run_left_the_actuator(monkeypatch):
     assert found.begun.input_um[0] == pytest.approx(left.stands_um)
     assert found.forecast.command_min > -1e-9
     assert found.reference.values[0] == pytest.approx(0.006)
+
+
+def test_a_start_that_would_trip_on_the_tracking_error_is_refused(monkeypatch):
+    left = left_by([100.0 * np.sin(np.linspace(0.0, np.pi, 1000))], STAGE, 1000.0)
+    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (left, "as left"))
+    given = ("waveform.soft_start_s=0.0", "limits.tracking_error_um=1.0", "limits.tracking_s=0.0")
+    far = compensated(loaded(PIEZO, *given, model=STAGE, **VOLTS), initial_state="last")
+    with pytest.raises(ConfigError) as refused:
+        check(far)
+    assert [each.key for each in refused.value.problems] == ["waveform"]
 
 
 class Offset(HysteresisModel):
