@@ -49,7 +49,6 @@ _log = logging.getLogger(__name__)
 
 _MANY = 50_000_000  # samples, which take some seconds
 _ROUNDING = 1e-9  # of the range of commands
-_INEXACT = 2e-3  # the same, of an inverse after the corners of a ramp
 _MORE_SLOPE = 1.5  # of a loop at its ends, than on average
 _SOFT_SHARE = 0.25  # of the slew limit, for a soft start
 _SLOWER = "lower frequency or amplitude, soften jumps (soft_start_s, soft_end_s, rise_s)"
@@ -315,7 +314,7 @@ def command_problems(
 ) -> list[ConfigProblem]:
     """Return the limits that the commands of a forecast exceed, by how much, and when.
 
-    The limiter clamps a smaller excess than :func:`_tolerated`.
+    An excess below a step of the output is none: the limiter takes it away.
     """
     limits = loaded.config.limits
     low, high = limits.command_range
@@ -325,7 +324,7 @@ def command_problems(
         rule = "every command must be a finite number"
         return [loaded.problem("compensator.model", rule, span)]
     found = []
-    if (excess := _excess(loaded, forecast)) > _tolerated(loaded):
+    if (excess := _excess(loaded, forecast)) > loaded.device.info.command_step:
         key = f"limits.{limits.range_key}"
         below = low - forecast.command_min == excess
         at_s = forecast.lowest_at_s if below else forecast.highest_at_s
@@ -401,19 +400,12 @@ def _excess(loaded: LoadedExperiment, forecast: Forecast) -> float:
     return excess if excess > _ROUNDING * (high - low) else 0.0
 
 
-def _tolerated(loaded: LoadedExperiment) -> float:
-    """Return the excess that is no error: a step of the output, or the accuracy of an inverse."""
-    low, high = loaded.config.limits.command_range
-    inexact = 0.0 if loaded.model is None else _INEXACT * (high - low)
-    return max(loaded.device.info.command_step, inexact)
-
-
 def _clamped(loaded: LoadedExperiment, forecast: Forecast) -> Iterator[str]:
-    limits = loaded.config.limits
+    limits, step = loaded.config.limits, loaded.device.info.command_step
     if excess := _excess(loaded, forecast):
         yield (
             f"limits.{limits.range_key}: commands exceed it by {excess:.2g} {limits.unit}, less "
-            f"than {_tolerated(loaded):.2g} {limits.unit}: the limiter clamps them"
+            f"than a step of the output, {step:.2g} {limits.unit}: the limiter clamps them"
         )
 
 

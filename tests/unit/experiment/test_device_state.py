@@ -27,12 +27,15 @@ from hilctl.experiment.device_state import (
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 from hilctl.models.linear_stages import CreepModel, FirstMode
+from hilctl.models.effective_field import FieldLosses
+from hilctl.models.linear_stages import CreepModel
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.metadata_keys import HEAT_FACT
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from tests.published import piezo_ppi
+from tests.unit.models.test_effective_field import field_model
 from tests.unit.models.test_staged import OMEGA
 
 RATE_HZ = 10_000.0
@@ -111,6 +114,18 @@ def test_compensator_goes_on_where_the_actuator_was_left(tmp_path, model):
     wanted = np.concatenate((np.full(inverse.preview, memory.stands_um), fed))[:500]
     np.testing.assert_allclose(came, wanted, atol=1e-9)
     np.testing.assert_allclose(came[110:], reference[110:], atol=1e-9)
+
+
+@pytest.mark.parametrize("down", [4, 31])
+def test_inverse_begins_at_the_last_command(down):
+    """The inverse of a lag is inexact after the corner of a ramp: it could begin below a limit."""
+    lagging = field_model(losses=FieldLosses(field_s=2.4e-3, growth=0.01))
+    up = 2.0 - 2.0 * np.cos(np.linspace(0.0, np.pi, 50))
+    model = StagedModel.around(lagging, delay_s=2.5e-3)
+    left = left_by([up, np.linspace(4.0, 0.0, down), np.zeros(100)], model, 100.0)
+    inverse = model.inverse(100.0)
+    inverse.restore(left.state)
+    assert inverse.process(np.full(5, left.stands_um)) == pytest.approx(np.zeros(5), abs=1e-4)
 
 
 @pytest.mark.parametrize("model", [OMEGA, STAGED, CREEPING], ids=["integrated", "staged", "creep"])
