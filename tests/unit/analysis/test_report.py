@@ -80,6 +80,11 @@ class TestSteadyPeriodicRun:
         assert (report.steady_cycles, report.settled) == (max(1, cycles - 1), cycles > 1)
         assert report.segments[0].frequency_hz == pytest.approx(RATE_HZ / period)
 
+    def test_a_cycle_and_a_half_have_not_settled(self, lagging) -> None:
+        parts = [Segment("sine", 0, 3000, 1500, 3000, 1000.0)]
+        report = summarize(lagging(1000.0, 3, segments=parts))
+        assert (report.steady_cycles, report.settled) == (1, False)
+
     def test_one_cycle_after_the_start_is_left_out(self, lagging) -> None:
         recording = lagging()
         recording.samples.displacement_um[:1000] = 500.0
