@@ -133,7 +133,7 @@ def check(
     except ModelError as error:
         raise ConfigError([*problems, loaded.problem("compensator.model", str(error))]) from None
     problems += _mark_problems(loaded, reference)
-    problems += _lead_in_problems(loaded, reference.values, begun.input_um)
+    problems += _lead_in_problems(loaded, reference.values, begun)
     problems += feedback_problems(loaded, begun.preview)
     problems += adaptation_problems(loaded, begun.preview)
     warnings = findings.warnings + adaptation_warnings(config, reference.segments)
@@ -260,13 +260,14 @@ def _start_problems(
 
 
 def _lead_in_problems(
-    loaded: LoadedExperiment, reference_um: F64, input_um: F64
+    loaded: LoadedExperiment, reference_um: F64, begun: CompensatorStart
 ) -> list[ConfigProblem]:
     """Return that the lead-in from the initial displacement would trip on the tracking error."""
     config, limits = loaded.config, loaded.config.interlocks
     if loaded.model is None or limits.tracking_error_um is None:
         return []
-    apart_um = np.abs(reference_um - input_um)[: config.lead_in_samples]
+    led_um = reference_um[begun.preview :][: config.lead_in_samples]
+    apart_um = np.abs(led_um - begun.input_um[: led_um.size])
     samples = (limits.tracking_s or 0.0) * config.sample_rate_hz
     if not np.count_nonzero(apart_um > limits.tracking_error_um) > samples:
         return []

@@ -26,9 +26,8 @@ from hilctl.experiment.device_state import (
 )
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
-from hilctl.models.linear_stages import CreepModel, FirstMode
 from hilctl.models.effective_field import FieldLosses
-from hilctl.models.linear_stages import CreepModel
+from hilctl.models.linear_stages import CreepModel, FirstMode
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.encoder import RecordingLayout
