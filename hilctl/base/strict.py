@@ -1,4 +1,4 @@
-"""Base of all pydantic models, and the pydantic names that models use."""
+"""Base of all pydantic models, the pydantic names that models use, and the words of its errors."""
 
 from collections.abc import Iterable
 from typing import Self
@@ -16,6 +16,7 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic_core import ErrorDetails
 
 __all__ = [
     "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "StrictModel",
@@ -24,10 +25,54 @@ __all__ = [
 ]  # fmt: skip
 
 
+_RULES = {
+    "missing": "is required",
+    "extra_forbidden": "unknown key",
+    "float_type": "must be a number",
+    "int_type": "must be a whole number",
+    "int_from_float": "must be a whole number",
+    "string_type": "must be text",
+    "bool_type": "must be true or false",
+    "tuple_type": "must be a list",
+    "dict_type": "must be a mapping of keys to values",
+    "model_type": "must be a mapping of keys to values",
+    "model_attributes_type": "must be a mapping of keys to values",
+    "finite_number": "must be a finite number",
+    "union_tag_not_found": "needs a 'kind'",
+    "greater_than": "must be > {gt}",
+    "greater_than_equal": "must be >= {ge}",
+    "less_than": "must be < {lt}",
+    "less_than_equal": "must be <= {le}",
+    "too_short": "must have at least {min_length} values",
+    "too_long": "must have at most {max_length} values",
+    "value_error": "{error}",
+}
+WORDS = {"literal_error", "union_tag_invalid"}
+"""Types of error of a value that is none of several words."""
+
+
+def rule_of(detail: ErrorDetails) -> str:
+    """Return the rule that a value breaks."""
+    kind = detail["type"]
+    if kind in _RULES:
+        return _RULES[kind].format(**detail.get("ctx", {}))
+    if kind in WORDS:
+        words = expected(detail)
+        several = " or " in words or ", " in words
+        return f"must be one of {words}" if several else f"must be {words}"
+    return detail["msg"][0].lower() + detail["msg"][1:]
+
+
+def expected(detail: ErrorDetails) -> str:
+    """Return the words that a value must be one of."""
+    context = detail.get("ctx", {})
+    return str(context.get("expected") or context.get("expected_tags"))
+
+
 def first_problem(error: ValidationError, whole: str = "message") -> str:
     """Return the place and text of the first problem; ``whole`` names the place of all data."""
-    first = error.errors(include_url=False, include_input=False)[0]
-    return f"{'.'.join(map(str, first['loc'])) or whole}: {first['msg']}"
+    first = error.errors(include_url=False)[0]
+    return f"{'.'.join(map(str, first['loc'])) or whole}: {rule_of(first)}"
 
 
 class StrictModel(BaseModel):

@@ -91,6 +91,8 @@ class TableRows:
                 f"or a row is there twice; set the sample rate (rate_hz) instead, about {many}"
             )
         step = float(np.median(steps)) if steps.size else 0.0
+        if not steps.size:
+            raise DataError(f"{self.path}: holds one row of numbers: needs at least two")
         if not step > 0.0:
             rule = "time must rise from row to row"
             raise DataError(f"{self.path}: {rule}, by {step:g} s as a rule here")

@@ -32,6 +32,7 @@ from yaml.composer import ComposerError
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
+from hilctl.base.strict import WORDS, expected, rule_of
 
 Loc: TypeAlias = tuple[str | int, ...]
 """Location of a value: keys and list indices."""
@@ -45,30 +46,7 @@ NUMBERS = {
 
 _DASHES = {"\N{MINUS SIGN}", "\N{EN DASH}", "\N{EM DASH}"}
 _QUOTED = re.compile(r"'([^']+)'")
-_RULES = {
-    "missing": "is required",
-    "extra_forbidden": "unknown key",
-    "float_type": "must be a number",
-    "int_type": "must be a whole number",
-    "int_from_float": "must be a whole number",
-    "string_type": "must be text",
-    "bool_type": "must be true or false",
-    "tuple_type": "must be a list",
-    "dict_type": "must be a mapping of keys to values",
-    "model_type": "must be a mapping of keys to values",
-    "model_attributes_type": "must be a mapping of keys to values",
-    "finite_number": "must be a finite number",
-    "union_tag_not_found": "needs a 'kind'",
-    "greater_than": "must be > {gt}",
-    "greater_than_equal": "must be >= {ge}",
-    "less_than": "must be < {lt}",
-    "less_than_equal": "must be <= {le}",
-    "too_short": "must have at least {min_length} values",
-    "too_long": "must have at most {max_length} values",
-    "value_error": "{error}",
-}
 _WITHOUT_VALUE = {"missing", "value_error", "extra_forbidden", "union_tag_not_found"}
-_WORDS = {"literal_error", "union_tag_invalid"}
 _NUMBER_TYPES = {"float_type", "int_type", "int_from_float"}
 _SPOKEN_BOOLEANS = {"yes", "no", "on", "off", "y", "n"}
 
@@ -125,29 +103,13 @@ def broken_rules(
 def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> ConfigProblem:
     first = group[0]
     place = loc = (*at, *first.loc)
-    rule, *others = (_rule(each.detail) for each in group)
+    rule, *others = (rule_of(each.detail) for each in group)
     rule = ", or ".join([rule, *(other.removeprefix("must be ") for other in others)])
     if first.detail["type"] == "value_error":  # a rule on several keys begins with the key
         place = (*loc, *loc_of(rule.split(" ", 1)[0]))
     known = first.parent.model_fields if first.parent else ()
     hint = next(filter(None, (_hint(each.detail, known) for each in group)), "")
     return ConfigProblem(where(place), dotted(loc), rule, _value(first.detail), hint)
-
-
-def _rule(detail: ErrorDetails) -> str:
-    kind = detail["type"]
-    if kind in _RULES:
-        return _RULES[kind].format(**detail.get("ctx", {}))
-    if kind in _WORDS:
-        expected = _expected(detail)
-        several = " or " in expected or ", " in expected
-        return f"must be one of {expected}" if several else f"must be {expected}"
-    return detail["msg"][0].lower() + detail["msg"][1:]
-
-
-def _expected(detail: ErrorDetails) -> str:
-    context = detail.get("ctx", {})
-    return str(context.get("expected") or context.get("expected_tags"))
 
 
 def _value(detail: ErrorDetails) -> str:
@@ -167,8 +129,8 @@ def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
     value, kind = detail["input"], detail["type"]
     if kind == "extra_forbidden":
         return did_you_mean(str(detail["loc"][-1]), known)
-    if kind in _WORDS:  # the rule lists all of them
-        given, words = detail.get("ctx", {}).get("tag", value), _QUOTED.findall(_expected(detail))
+    if kind in WORDS:  # the rule lists all of them
+        given, words = detail.get("ctx", {}).get("tag", value), _QUOTED.findall(expected(detail))
         if given in words:  # written as Python does, so with an escape
             return f'write it in double quotes: "{given}"'
         return did_you_mean(str(given), words, listed=True) if len(words) > 1 else ""
@@ -187,9 +149,10 @@ def odd_characters(lines: Sequence[str], number: int) -> str:
     """Return which invisible character a line, or the one before it, has; empty for none."""
     for at in range(max(0, number - 1), min(number + 1, len(lines))):
         for mark in lines[at]:
-            if mark != " " and unicodedata.category(mark) in {"Zs", "Cf"}:
-                called = f"U+{ord(mark):04X} ({unicodedata.name(mark, 'without a name')})"
-                return f"line {at + 1} has the invisible character {called}: write a space"
+            if mark == "\t" or (mark != " " and unicodedata.category(mark) in {"Zs", "Cf"}):
+                named = unicodedata.name(mark, "tab" if mark == "\t" else "without a name")
+                called = f"U+{ord(mark):04X} ({named})"
+                return f"line {at + 1} has the invisible character {called}: write spaces"
     return ""
 
 

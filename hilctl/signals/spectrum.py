@@ -11,6 +11,7 @@ from hilctl.base.types import C128, F64, I64
 from hilctl.signals.cycle_metrics import fold
 
 _BINS = 8192
+_SHORTEST = 8  # samples of a part, for a few lines
 _AVERAGES = 8  # segments of an averaged spectrum that fit side by side
 _TIMES = 60
 _FEWEST_MEANS = 4  # that fit side by side at the longest averaging time
@@ -57,13 +58,13 @@ def amplitude_spectrum(values: F64, sample_rate_hz: float) -> tuple[F64, F64]:
     return hz[1:], np.sqrt(2.0 * power[1:])
 
 
-def density(values: F64, sample_rate_hz: float, shortest: int = 2) -> tuple[F64, F64, float]:
+def density(values: F64, sample_rate_hz: float, shortest: int = 0) -> tuple[F64, F64, float]:
     """Return frequencies, the amplitude density per root Hz, float64[k] each, and its median.
 
     Averaged spectra of overlapping parts without their linear trend (Welch, Hann windows), of at
     least ``shortest`` samples each. The median is that of white noise with this mean power.
     """
-    size = min(values.size, max(values.size // _AVERAGES, shortest))
+    size = min(values.size, max(values.size // _AVERAGES, shortest, _SHORTEST))
     hz, power = signal.welch(values, sample_rate_hz, nperseg=size, detrend=signal.detrend)
     averages = 2 * values.size // size - 1
     scale = (1.0 - 1.0 / (9.0 * averages)) ** 3  # median over mean of averaged powers

@@ -257,6 +257,8 @@ def assigned(assignments: Sequence[str]) -> dict[str, Any]:
         key, equals, value = text.partition("=")
         if key not in {"gain", "offset", "inverse"} or not equals:
             raise InputError(f"must be gain=NUMBER, offset=NUMBER or inverse=in|out: {text!r}")
+        if key in wanted:
+            raise InputError(f"{key} is given twice: {text!r}")
         if key == "inverse" and value not in {"in", "out"}:
             raise InputError(f"inverse must be in or out: {value!r}")
         try:

@@ -244,7 +244,7 @@ def test_a_recording_agrees_with_its_report():
 
 @pytest.mark.parametrize(("change", "problem"), [
     ({LABELS_FACT: "3"}, "metadata hilctl.run: labels must be texts and numbers by name"),
-    ({"segments": "[{}]"}, "metadata hilctl.run: segments: 0.label: Field required"),
+    ({"segments": "[{}]"}, "metadata hilctl.run: segments: 0.label: is required"),
 ])  # fmt: skip
 def test_a_recording_that_nobody_can_read_says_why(tmp_path, change, problem):
     found = made_entry(tmp_path, {**RUN, **change}, END)

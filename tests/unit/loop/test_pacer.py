@@ -121,7 +121,7 @@ class TestMisses:
     def test_a_share_that_goes_on_is_not(self):
         reason, tick = self.stalled(dict.fromkeys(range(400), 125 * PERIOD_NS))
         assert tick == 5 * 126 - 1
-        assert reason == (
+        assert reason.startswith(
             "timing not kept: 625 deadline misses up to tick 629, more than 10 in 1000 ticks"
         )
 

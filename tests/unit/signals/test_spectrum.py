@@ -43,6 +43,12 @@ def test_a_sine_has_its_amplitude_and_white_noise_its_density():
     assert density(WHITE, RATE_HZ, WHITE.size)[2] == pytest.approx(expected, rel=0.02)
 
 
+def test_a_short_signal_has_a_density():
+    hz, density_um, median_um = density(np.random.default_rng(1).normal(size=16), 10.0)
+    assert hz.size == density_um.size > 1
+    assert median_um > 0.0
+
+
 def test_allan_deviation_of_white_noise_falls_with_the_root_of_time():
     tau_s, found = allan_deviation(WHITE + 7.0, RATE_HZ)
     assert (tau_s[0], tau_s[-1]) == (1.0 / RATE_HZ, 5.0)
