@@ -38,6 +38,7 @@ from hilctl.recording.run_summary import read_ends
 
 _STILL_S = 1.0
 _AT_REST_S = 0.1  # after which the stages of any actuator are at rest
+_FEWEST_SAMPLES = 16  # which a delay and a preview need at a low rate
 _FIRST_STEP_UM = 1e-4
 _SETTLED_UM = 1e-9
 _MOST_STEPS = 20
@@ -162,7 +163,8 @@ def left_by(
         forward.stand(more_s)
         inverse.stand(more_s)
         stands_um = float(forward.process(np.array([last]))[0])
-    stands_um = _settle(inverse, stands_um, last, max(round(_AT_REST_S * sample_rate_hz), 1))
+    samples = max(round(_AT_REST_S * sample_rate_hz), _FEWEST_SAMPLES)
+    stands_um = _settle(inverse, stands_um, last, samples)
     return InitialState(inverse.state(), stands_um, "")
 
 

@@ -169,15 +169,16 @@ def test_the_output_rests_at_the_safe_value(tmp_path, facts, safe):
     assert inverse.process(np.full(10, left.stands_um))[-1] == pytest.approx(safe, abs=1e-6)
 
 
-@pytest.mark.parametrize("stage", [
-    {"delay_s": 2.4 / RATE_HZ},
-    {"structure": FirstMode(natural_hz=800.0, damping_ratio=0.2)},
+@pytest.mark.parametrize(("rate_hz", "rest", "stage"), [
+    (RATE_HZ, 2000, {"delay_s": 2.4 / RATE_HZ}),
+    (RATE_HZ, 2000, {"structure": FirstMode(natural_hz=800.0, damping_ratio=0.2)}),
+    (10.0, 1, {"delay_s": 0.0226}),
 ])  # fmt: skip
-def test_the_safe_value_is_held_after_steps_of_the_command(stage):
+def test_the_safe_value_is_held_after_steps_of_the_command(rate_hz, rest, stage):
     """The inverse of a part of a sample, or of a structure, is inexact at steps."""
     model = STAGED.model_copy(update=stage)
-    left = left_by([np.repeat(COMMAND[::50], 50), np.zeros(2000)], model, RATE_HZ)
-    inverse = model.inverse(RATE_HZ)
+    left = left_by([np.repeat(COMMAND[::50], 50), np.zeros(rest)], model, rate_hz)
+    inverse = model.inverse(rate_hz)
     inverse.restore(left.state)
     assert np.abs(inverse.process(np.full(100, left.stands_um))).max() < 1e-9
 
