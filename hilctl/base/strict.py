@@ -38,7 +38,7 @@ _RULES = {
     "model_type": "must be a mapping of keys to values",
     "model_attributes_type": "must be a mapping of keys to values",
     "finite_number": "must be a finite number",
-    "union_tag_not_found": "needs a 'kind'",
+    "union_tag_not_found": "needs a {discriminator}",
     "greater_than": "must be > {gt}",
     "greater_than_equal": "must be >= {ge}",
     "less_than": "must be < {lt}",

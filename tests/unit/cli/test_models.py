@@ -28,7 +28,7 @@ def refined(monkeypatch, tmp_path, hilctl):
 
     def refine(truth, *options):
         runs = [history(truth, i, noise_um=0.05) for i in range(4)]
-        loaded = "hilctl.identify.refine.refinement.load_runs"
+        loaded = "hilctl.api.models.load_runs"
         monkeypatch.setattr(loaded, lambda paths, model: runs)
         names = [f"{i}.mcap" for i in range(4)]
         return hilctl("refine", tmp_path / "old.yaml", *names, "--output", output, *options)
