@@ -262,7 +262,7 @@ def _start_problems(
 def _lead_in_problems(
     loaded: LoadedExperiment, reference_um: F64, begun: CompensatorStart
 ) -> list[ConfigProblem]:
-    """Return that the lead-in from the initial displacement would trip on the tracking error."""
+    """Return a problem if the lead-in from the initial displacement trips on the tracking error."""
     config, limits = loaded.config, loaded.config.interlocks
     if loaded.model is None or limits.tracking_error_um is None:
         return []

@@ -176,7 +176,7 @@ class CampaignRow:
     """Outcome of a step."""
 
     result: str = PLANNED  # ``planned``, ``completed``, or code and reason
-    figures: RunFigures = RunFigures()  # noqa: RUF009  frozen
+    figures: RunFigures = field(default_factory=RunFigures)
     recording: str = ""  # name of its recording in the campaign's folder, or empty
     code: str = PLANNED  # ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``
     kept: bool = False  # whether it was done already
