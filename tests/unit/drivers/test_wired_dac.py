@@ -213,7 +213,7 @@ def test_auxiliary_channels_of_either_device(rig):
     bench.device.open(10.0, 1)
     assert np.isfinite(bench.device.aux).all()
     reading = np.empty(1)
-    for sample in range(4):
+    for sample in range(40):  # until the rig has settled, as both are read one after the other
         bench.device.exchange(sample, np.array([2.5]), reading, np.empty(1))
     assert bench.device.aux[1] == pytest.approx(-2.5, abs=1e-3)
     assert bench.device.aux[0] == pytest.approx(reading[0] / 12.5, abs=0.1)
