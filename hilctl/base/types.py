@@ -22,6 +22,9 @@ C128: TypeAlias = npt.NDArray[np.complex128]
 I64: TypeAlias = npt.NDArray[np.int64]
 """An int64 array, used for indices and nanoseconds."""
 
+Mask: TypeAlias = npt.NDArray[np.bool_]
+"""A bool array, used to choose samples or rows."""
+
 U8: TypeAlias = npt.NDArray[np.uint8]
 """A uint8 array, used for bytes."""
 

@@ -95,6 +95,7 @@ def judge(
 
 def judgement_of(data: FitData, responses_um: F64, stroke_um: float | None = None) -> Evaluation:
     """Return the errors of responses, float64[N], at the evaluated samples of the records."""
+    responses_um = np.where(data.evaluated, responses_um, data.target_um)
     errors_um = responses_um - data.target_um
     modelled_um = tuple(responses_um[place] for place in data.places)
     targets_um = [data.target_um[place] for place in data.places]

@@ -12,7 +12,7 @@ import numpy.typing as npt
 from scipy.fft import irfft, rfft
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64, F64_2D, CommandUnit
+from hilctl.base.types import F64, F64_2D, CommandUnit, Mask
 from hilctl.identify.data.records import History, Record, Records, SteadyLoop
 from hilctl.kernels.hysteresis import play_outputs, play_sum_shared, rest_memory
 from hilctl.kernels.jit import kernel
@@ -235,6 +235,17 @@ class FitData:
         few = copy(self)
         few._keep(runs, self.target_um[kept])  # noqa: SLF001  a copy of the same class
         return few, scale[kept]
+
+    @cached_property
+    def evaluated(self) -> Mask:
+        """Whether each of the N samples is evaluated, see :meth:`History.evaluated`: bool[N]."""
+        parts = zip(self.records, self.places, strict=True)
+        return np.concatenate([
+            record.evaluated()[place.start - place.stop :]
+            if isinstance(record, History)
+            else np.ones(_size(place), dtype=np.bool_)
+            for record, place in parts
+        ])  # fmt: skip
 
     @cached_property
     def creep(self) -> F64:

@@ -5,13 +5,10 @@ from dataclasses import dataclass
 from typing import TypeAlias
 
 import numpy as np
-import numpy.typing as npt
 from scipy.linalg import cho_factor, cho_solve, qr
 from scipy.optimize import least_squares, nnls
 
-from hilctl.base.types import F64, I64
-
-Mask: TypeAlias = npt.NDArray[np.bool_]
+from hilctl.base.types import F64, I64, Mask
 
 RIDGE = 1e-3  # weight of the densities themselves, relative to the longest column
 

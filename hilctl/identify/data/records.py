@@ -8,10 +8,11 @@ import numpy as np
 from scipy.interpolate import CubicSpline
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64, I64
+from hilctl.base.types import F64, I64, Mask
 from hilctl.kernels.hysteresis import play_outputs, rest_memory
 
 FEWEST_POINTS = 16
+SETTLING = 3  # times the length of a gap: the motion after it that is not evaluated
 
 
 @dataclass(frozen=True, slots=True)
@@ -98,6 +99,19 @@ class History:
         rate = np.diff(self.command, prepend=self.command[0]) * self.sample_rate_hz
         return np.ascontiguousarray(self.command), rate, self.ignore
 
+    def evaluated(self) -> Mask:
+        """Return whether each sample is evaluated: bool[n].
+
+        Samples from ``ignore`` on are, except skipped ticks and the motion after them: the command
+        jumps to where it would have been, which excites dynamics that smooth motion does not show.
+        """
+        left_out = np.zeros(self.command.size, dtype=np.bool_)
+        left_out[: self.ignore] = True
+        for gap in np.split(self.held, np.flatnonzero(np.diff(self.held) > 1) + 1):
+            if gap.size:
+                left_out[gap[0] : gap[0] + (1 + SETTLING) * gap.size] = True
+        return ~left_out
+
     def rate(self) -> F64:
         """Return the rate of the motion, float64[n]; skipped ticks do not make it faster."""
         kept = np.setdiff1d(np.arange(self.command.size), self.held)
@@ -159,12 +173,13 @@ class ThinHistory(History):
 def thinned(records: Sequence[Record], most: int = MOST_SAMPLES) -> tuple[Record, ...]:
     """Return records, of each longer history about ``most`` samples and its turning points.
 
+    Samples that are not evaluated because of skipped ticks are left out.
     Turning points determine the memory of a model without dynamics. The other samples are random,
     one per interval: evenly spaced ones might meet a few phases of a periodic command only.
     """
     return tuple(
         _thin(record, most)
-        if isinstance(record, History) and record.command.size > most
+        if isinstance(record, History) and (record.command.size > most or record.held.size)
         else record
         for record in records
     )
@@ -185,8 +200,9 @@ def turning_points(command: F64) -> I64:
 
 def _thin(record: History, most: int) -> ThinHistory:
     command, rates, ignore = record.run()
-    edges = np.linspace(0, command.size, most + 1).astype(np.int64)
+    edges = np.linspace(0, command.size, min(most, command.size) + 1).astype(np.int64)
     spread = np.random.default_rng(SEED).integers(edges[:-1], edges[1:])
+    spread = spread[record.evaluated()[spread] | (spread < ignore)]
     index = np.unique(np.concatenate(([0], spread, turning_points(command))))
     return ThinHistory(
         label=record.label,

@@ -6,7 +6,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from hilctl.base.types import F64, F64_2D, I64
+from hilctl.base.types import F64, F64_2D, I64, Mask
 from hilctl.kernels.jit import kernel
 
 
@@ -203,11 +203,11 @@ class Motion:
     travel: F64  # float64[n], change of the command since the sample before, of its peak-to-peak
     step_s: F64
     swing: F64  # float64[n], swing of the displacement around a sample, of the stroke
-    judged: int
+    judged: Mask  # bool[n]
 
     @classmethod
     def of(
-        cls, signals: tuple[F64, F64], step_s: F64, judged: int, reach: float, stroke_um: float
+        cls, signals: tuple[F64, F64], step_s: F64, judged: Mask, reach: float, stroke_um: float
     ) -> "Motion":
         """Return the motion of a command and a displacement in um, float64[n] each."""
         command, displacement_um = signals
@@ -222,7 +222,7 @@ class Motion:
             np.diff(np.cumsum(self.travel)[samples], prepend=0.0),
             np.diff(np.cumsum(self.step_s)[samples], prepend=0.0),
             self.swing[samples],
-            int(np.searchsorted(samples, self.judged)),
+            self.judged[samples],
         )
 
 
@@ -243,7 +243,7 @@ def chosen(motions: Sequence[Motion], most: int) -> Rows:
     for motion, swing, time in zip(motions, swung, passed, strict=True):
         place = np.cumsum(swing / all_swung + time / all_passed) * (0.5 * most)
         rows = 1 + np.flatnonzero(np.diff(np.floor(place)) > 0.0)
-        rows = rows[rows >= motion.judged]
+        rows = rows[motion.judged[rows]]
         close = (swing / all_swung + time / all_passed)[rows] * all_passed / motion.step_s[rows]
         samples.append(rows.astype(np.int64))
         weights.append(motion.swing[rows] ** -2.0 * close**-REPEATED)

@@ -150,7 +150,7 @@ class Prepared:
         mean = np.full(kept.size, command[0])
         mean[1:] = np.diff(held[kept]) / np.diff(kept)
         step_s, both = steps / rate_hz, (at_end, derivatives[0, kept])
-        judged = int(np.searchsorted(kept, record.ignore))
+        judged = record.evaluated()[kept]
         motion = Motion.of(both, step_s, judged, self.reach, self.stroke_um)
         return Run(rate_hz, kept, step_s, at_end, mean, derivatives, motion)
 

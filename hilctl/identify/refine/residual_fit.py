@@ -91,6 +91,7 @@ def _late_s(model: StagedModel, runs: Sequence[History]) -> tuple[float, float, 
 def _delay_sums(operator: ResidualOperator, x: F64, run: History, rest: float) -> tuple[F64, F64]:
     tables, window = operator.tables(run.sample_rate_hz)
     rows = np.unique(np.linspace(run.ignore, x.size - 1, DELAY_ROWS).astype(np.int64))
+    rows = rows[run.evaluated()[rows]]
     columns = np.zeros((rows.size, 1 + 4 * len(DELAY_LENGTHS) + 2))
     residual_columns(np.ascontiguousarray(x), rows, window, tables, columns)
     columns = np.column_stack([np.ones(rows.size), columns])
@@ -296,7 +297,8 @@ def _rows(run: History) -> I64:
     """Return random samples, one per interval: int64[N]."""
     judged = run.command.size - run.ignore
     edges = np.linspace(run.ignore, run.command.size, min(ROWS, judged) + 1).astype(np.int64)
-    return np.asarray(np.random.default_rng(SEED).integers(edges[:-1], edges[1:]), dtype=np.int64)
+    rows = np.random.default_rng(SEED).integers(edges[:-1], edges[1:])
+    return np.asarray(rows[run.evaluated()[rows]], dtype=np.int64)
 
 
 def _alike() -> F64:

@@ -15,7 +15,7 @@ from typing import Any
 import numpy as np
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64, I64
+from hilctl.base.types import F64, I64, Mask
 from hilctl.identify.evaluation import weight_roots
 from hilctl.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel, StartOutcome
 from hilctl.identify.fit_data import GROWTH, LAG_S, FitData, Linear
@@ -133,8 +133,8 @@ class StagedEnd:
     point: Point
     errors_um: F64
     slopes: F64  # float64[N, p], their derivatives by ``point.pack()``
-    free: np.ndarray[tuple[int], np.dtype[np.bool_]]  # bool[p], neither fixed nor at a bound
-    held: np.ndarray[tuple[int], np.dtype[np.bool_]]
+    free: Mask  # bool[p], neither fixed nor at a bound
+    held: Mask
     scale: F64  # float64[N], square root of the weights at the end
     starts: tuple[StartOutcome, ...]
 

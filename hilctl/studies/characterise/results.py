@@ -249,16 +249,17 @@ def validate(
 ) -> ValidationReference:
     """Validate a model on a recording that starts with a conditioning cycle."""
     parts = recording.segments[1:]
-    stop = parts[-1].steady_stop
-    command, measured_um = without_gaps(recording, 0, stop)
+    history = _history(recording)
+    command, measured_um = history.command, history.displacement_um
     modelled_um = model.forward(recording.sample_rate_hz).process(command)
     low, high = model.input_range or (-np.inf, np.inf)
     slack = _SLACK * (high - low) if np.isfinite(high - low) else 0.0
     good = (command >= low - slack) & (command <= high + slack)
-    steady = np.zeros(stop, dtype=np.bool_)
+    steady = np.zeros(command.size, dtype=np.bool_)
     for part in parts:
         steady[part.steady_start : part.steady_stop] = True
     good &= steady
+    modelled_um = np.where(history.evaluated(), modelled_um, measured_um)
     error_um = modelled_um[good] - measured_um[good]
     whole_um = max(float(np.ptp(measured_um[good])), 1e-12)
     floor_um = noise_um * cycle_metrics.expected_maximum(error_um.size)

@@ -93,7 +93,8 @@ def test_rdpi_with_exponential_weights(loops_of, layout):
     assert found.model.output_offset_um == pytest.approx(-3.0, abs=0.02)
 
 
-def test_ppi_with_free_weights_from_a_decaying_history():
+@pytest.mark.parametrize("skipped", [False, True])
+def test_ppi_with_free_weights_from_a_decaying_history(skipped):
     truth = PpiModel(
         input_unit="V",
         direct=1.0,
@@ -104,7 +105,10 @@ def test_ppi_with_free_weights_from_a_decaying_history():
     time = np.arange(3000)
     command = 1.8 + 1.8 * np.sin(2 * np.pi * time / 200) * np.interp(time, [1000, 2800], [1, 0])
     displacement_um = truth.forward(200.0).process(command)
-    history = History("decay", command, displacement_um, 200.0, ignore=100)
+    held = np.arange(1010, 1015) if skipped else np.empty(0, np.int64)
+    displacement_um[held] += 5.0
+    displacement_um[held + 10] -= 5.0  # still in motion after the jump of the command
+    history = History("decay", command, displacement_um, 200.0, 100, held)
     found = fit("ppi", [history], plays=4, weights="free", offset=True)
     assert found.own_peak_percent < 0.01
     np.testing.assert_allclose(found.model.weights, truth.weights, atol=2e-3)

@@ -42,6 +42,18 @@ def test_without_lag_pairs_a_command_with_a_later_displacement():
     assert history.ignore == 5
 
 
+@pytest.mark.parametrize(("held", "left_out"), [
+    ([], []),
+    ([20], [20, 21, 22, 23]),
+    ([20, 21, 40], [*range(20, 28), *range(40, 44)]),
+    ([48, 49], [48, 49]),
+    ([2], [2, 3, 4, 5]),
+])  # fmt: skip
+def test_skipped_ticks_and_the_motion_after_them_are_not_evaluated(held, left_out):
+    history = History("x", np.arange(50.0), np.arange(50.0), 100.0, 3, np.array(held, np.int64))
+    assert set(np.flatnonzero(~history.evaluated())) == {0, 1, 2, *left_out}
+
+
 @pytest.mark.parametrize("lag", [-1, 49])
 def test_impossible_lags_are_refused(lag):
     with pytest.raises(DataError, match="x: "):

@@ -1,6 +1,7 @@
 """Records thinned: what is left of a command, a displacement and what is to be judged."""
 
 import math
+from dataclasses import replace
 from itertools import pairwise
 
 import numpy as np
@@ -93,8 +94,12 @@ def test_what_is_left_is_enough_of_both_signals(frequency_hz):
 @pytest.mark.parametrize("ignore", [0, 1, 20, 21, 1003])
 def test_no_sample_is_judged_that_is_to_be_ignored(ignore):
     run = Prepared([history(ignore=ignore)]).runs[0]
-    assert run.kept[run.motion.judged] >= ignore
-    assert run.motion.judged == 0 or run.kept[run.motion.judged - 1] < ignore
+    assert run.motion.judged.tolist() == (run.kept >= ignore).tolist()
+
+
+def test_no_sample_is_judged_after_skipped_ticks():
+    run = Prepared([replace(history(), held=np.arange(1000, 1020))]).runs[0]
+    assert run.motion.judged.tolist() == ((run.kept < 1000) | (run.kept >= 1080)).tolist()
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 2.5e-4])
