@@ -225,7 +225,7 @@ def bandwidth_of(kind: str, ki_per_s: float, rate_hz: float) -> float:
 def rounded_down(value: float) -> float:
     """Return a value > 0 rounded down to three digits."""
     unit = 10.0 ** (math.floor(math.log10(value)) - 2)
-    return math.floor(value / unit) * unit
+    return float(f"{math.floor(value / unit) * unit:.3g}")
 
 
 OFFSET_SHARE = 0.1
