@@ -19,7 +19,7 @@ import numpy as np
 from pydantic import PlainSerializer, PlainValidator
 
 from hilctl.base.calibration import CalibrationFile, NamedCalibration
-from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.device import DeviceInfo, DeviceOptions, DeviceReadings
 from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl.base.files import TextFiles
 from hilctl.base.types import F64
@@ -127,13 +127,10 @@ class DacDevice(ABC):
         except DeviceError as error:
             raise self._failed(action, error, self._release) from None
 
-    def look(self) -> tuple[float, float | None]:
-        """Connect, return displacement and output, and disconnect; nothing is changed.
+    def look(self) -> DeviceReadings:
+        """Connect, return the readings, and disconnect; nothing is changed.
 
         No step of the profile is sent, and no watchdog is armed, fed on purpose or cleared.
-
-        Returns:
-            Displacement in um, and the output in the command's unit; None if it cannot be known.
         """
         action = "read the sensor and the output"
         if self._block:
@@ -142,7 +139,9 @@ class DacDevice(ABC):
             displacement_um, output = self._look()
             if self._curve is not None:
                 displacement_um = float(np.interp(displacement_um, *self._curve))
-            return displacement_um, output
+            measured = np.full(1, np.nan)
+            self._measure_output(measured)
+            return DeviceReadings(displacement_um, output, measured.item())
         except DeviceError as error:
             raise self._error(action, str(error)) from None
         finally:
@@ -274,8 +273,11 @@ class DacDevice(ABC):
         return None
 
     def _look(self) -> tuple[float, float | None]:
-        """Connect and read, see :meth:`look`; :meth:`_release` follows."""
+        """Connect, and return displacement and output; :meth:`_release` follows."""
         raise DeviceError("it can't be read without being set up")
+
+    def _measure_output(self, measured: F64) -> None:  # noqa: B027  most devices do not measure
+        """Set ``measured[0]`` to the command as measured, if it is measured."""
 
     @abstractmethod
     def _exchange(

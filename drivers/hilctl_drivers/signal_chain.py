@@ -14,7 +14,7 @@ from typing import Annotated, Literal, Self, TypeAlias, TypeVar
 import numpy as np
 from pydantic import AfterValidator, Field, field_validator, model_validator
 
-from hilctl.base.calibration import AmplifierCalibration, NamedCalibration
+from hilctl.base.calibration import AmplifierCalibration, CalibrationDate, NamedCalibration
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
@@ -122,7 +122,7 @@ class Sensor(StrictModel):
 class Calibration(StrictModel):
     """Calibration of gain and sensitivity, as a note that is kept with each recording."""
 
-    date: str = Field(description="date of the calibration")
+    date: CalibrationDate = Field(description="date of the calibration")
     by: str = Field(description="person who calibrated")
     reference: str = Field(description="reference standard, or document")
 

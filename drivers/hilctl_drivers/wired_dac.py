@@ -192,7 +192,6 @@ class SteppedDac(WiredDac):
             self._run("feed")
 
     def _measure_output(self, measured: F64) -> None:
-        """Fill in the command that the output is measured at, if it is measured."""
         if self._measure is not None:
             gain, offset = self._measured_by
             measured[0] = self._measure() * gain + offset

@@ -5,7 +5,7 @@ A curve is a table of points, so that readings are interpolated and never extrap
 
 from dataclasses import dataclass
 from datetime import date
-from typing import Annotated, Self
+from typing import Annotated, Self, TypeAlias
 
 import numpy as np
 
@@ -25,6 +25,9 @@ def _date(value: object) -> date:
         raise ValueError("must be a date, such as 2026-01-31") from None
 
 
+CalibrationDate: TypeAlias = Annotated[date, BeforeValidator(_date)]
+
+
 class CalibrationOrigin(StrictModel):
     """Origin of a calibration, and what it leaves.
 
@@ -35,7 +38,7 @@ class CalibrationOrigin(StrictModel):
         residual_max: Largest absolute residual.
     """
 
-    date: Annotated[date, BeforeValidator(_date)]
+    date: CalibrationDate
     by: str
     reference: str
     residual_rms: Annotated[float, Field(ge=0.0)]
@@ -62,7 +65,8 @@ class SensorCalibration(CalibrationOrigin):
         low, high = self.range_um
         first, last = (self.table[0][0], self.table[-1][0]) if self.table else (low, high)
         if not first <= low < high <= last:
-            raise ValueError(f"range_um must rise within the table's readings: {[low, high]}")
+            inside = f" within the table's readings, {first:g} to {last:g}" if self.table else ""
+            raise ValueError(f"range_um must rise{inside}, got [{low:g}, {high:g}]")
         for name, values in zip(("readings", "displacements"), self.points, strict=True):
             if not (np.diff(values) > 0.0).all():
                 rule = "if they fall, reverse the sign of device.sensor"

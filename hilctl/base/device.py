@@ -7,7 +7,7 @@ Devices implement :class:`Device` in ``hilctl_drivers`` or in other packages;
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
 
 from hilctl.base.calibration import NamedCalibration
 from hilctl.base.errors import InputError
@@ -316,15 +316,20 @@ class WatchdogDevice(Protocol):
         ...
 
 
+class DeviceReadings(NamedTuple):
+    """Readings of a device without a run."""
+
+    displacement_um: float
+    output: float | None  # in the command's unit; None if unknown
+    measured: float = math.nan  # command as measured by the device; NaN if it is not measured
+
+
 @runtime_checkable
 class ReadableDevice(Protocol):
     """A device that can be read without opening it."""
 
-    def look(self) -> tuple[float, float | None]:
-        """Connect, return displacement and output, and disconnect without changing anything.
-
-        Returns:
-            Displacement in um, and the output in the command's unit or None if unknown.
+    def look(self) -> DeviceReadings | tuple[float, float | None]:
+        """Connect, return the readings, and disconnect without changing anything.
 
         Raises:
             DeviceError: The device is open, cannot be reached, is another device, or answers

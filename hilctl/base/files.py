@@ -281,8 +281,11 @@ def no_such_file(path: Path) -> str:
     if path.is_symlink():
         return f"{path}: no such file (it is a link to {path.readlink()})"
     try:
-        names = [] if path.exists() else [each.name for each in path.parent.iterdir()]
+        found = [] if path.exists() else list(path.parent.iterdir())
     except OSError:
-        names = []
+        found = []
+    if path.suffix:  # model.html is not meant by model.yaml
+        found = [each for each in found if did_you_mean(path.suffix, [each.suffix], listed=True)]
+    names = [each.name for each in found]
     hint = did_you_mean(path.name, names, listed=True)  # a folder may have many
     return f"{path}: no such file" + (f" ({hint})" if hint else "")

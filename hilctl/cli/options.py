@@ -72,7 +72,16 @@ def _keys(node: dict[str, Any], definitions: dict[str, Any], at: str = "") -> It
 
 def recordings_argument(meaning: str, metavar: str = "RUN") -> Any:
     """Return an argument for the files of recordings."""
-    return typer.Argument(help=meaning, metavar=metavar, autocompletion=recording_paths)
+    return typer.Argument(
+        help=meaning, metavar=metavar, autocompletion=recording_paths, parser=_named_path
+    )
+
+
+def _named_path(text: str) -> Path:
+    """Return a path; refuse an empty text, such as an unset variable, that would be ``.``."""
+    if not text:
+        raise typer.BadParameter("must not be empty")
+    return Path(text)
 
 
 ExperimentFile = Annotated[

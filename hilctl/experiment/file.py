@@ -492,7 +492,8 @@ class Experiment(StrictModel):
             return limits
         low_um, high_um = limits.stroke_um
         most_um = _TRACKING_SHARE * (high_um - low_um)
-        return limits.model_copy(update={"tracking_error_um": most_um, "tracking_s": _TRACKING_S})
+        time_s = max(_TRACKING_S, 1.0 / self.sample_rate_hz)
+        return limits.model_copy(update={"tracking_error_um": most_um, "tracking_s": time_s})
 
     def command_limits(self) -> CommandLimits:
         """Return the settings of the limiter, in the device's unit."""

@@ -225,7 +225,7 @@ class IlcSession:
                 on_rows(rows)
             if all(each.done for each in self._learning):
                 return "; ".join(sorted({each.done for each in self._learning}))
-        return f"{cycles} learning cycles are done"
+        return f"no convergence in {cycles} learning cycles: specify more with --cycles"
 
     def _next_run(self, number: int, coefficients: Sequence[C128]) -> Path:
         """Run with a correction, which is kept beside the recording; return that."""

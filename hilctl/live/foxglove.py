@@ -19,7 +19,7 @@ from typing import TYPE_CHECKING, Any, Literal
 
 import numpy as np
 
-from hilctl.base.errors import InputError, RunError
+from hilctl.base.errors import InputError
 from hilctl.base.samples import COLUMNS
 from hilctl.base.types import F64
 from hilctl.live.run_reader import RunList, RunReader
@@ -167,7 +167,7 @@ def _text(value: object) -> str:
 class FoxgloveServer:
     """Serves the active run on a port, 0 for any.
 
-    Raise InputError if the library is not installed, RunError if the port is not available.
+    Raise InputError if the library is not installed, or the port is not available.
     """
 
     def __init__(self, chosen: Callable[[list[RunFolder]], RunFolder | None], port: int) -> None:
@@ -248,5 +248,5 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
             context=context, message_backlog_size=_BACKLOG,
         )  # fmt: skip
     except RuntimeError as error:
-        raise RunError(f"port {port} of 127.0.0.1: {error}") from None
+        raise InputError(f"--port {port}: {error}") from None
     return context, channels, server

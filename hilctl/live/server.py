@@ -35,7 +35,7 @@ from websockets.headers import parse_subprotocol
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from hilctl.base.errors import HilctlError, InputError, RunError
+from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl.base.formatting import finite_json, printable
 from hilctl.base.strict import StrictModel, first_problem
@@ -236,7 +236,7 @@ def _response(status: HTTPStatus, kind: str, body: bytes, policy: str = _POLICY)
 
 
 class LiveServer:
-    """Serves the page of all runs of this user on a port, 0 for any, unless taken (RunError)."""
+    """Serves the page of all runs of this user on a port, 0 for any, unless taken (InputError)."""
 
     def __init__(
         self, chosen: Callable[[list[RunFolder]], RunFolder | None], port: int = 0
@@ -383,7 +383,7 @@ class LiveServer:
 
 
 def _listeners(port: int) -> list[socket.socket]:
-    """Return sockets on a port of 127.0.0.1 and ::1 (with IPv6); raise RunError if it is taken."""
+    """Return sockets on a port of 127.0.0.1 and ::1 (with IPv6); raise InputError if taken."""
     with ExitStack() as stack:
         try:
             first = stack.enter_context(socket.create_server(("127.0.0.1", port)))
@@ -393,6 +393,6 @@ def _listeners(port: int) -> list[socket.socket]:
                     address = ("::1", first.getsockname()[1])
                     found.append(socket.create_server(address, family=socket.AF_INET6))
         except OSError as error:
-            raise RunError(f"port {port} of 127.0.0.1: {reason(error, ADDRESS_REMEDIES)}") from None
+            raise InputError(f"--port {port}: {reason(error, ADDRESS_REMEDIES)}") from None
         stack.pop_all()
         return found

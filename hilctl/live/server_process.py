@@ -55,7 +55,7 @@ def serve_runs(
 
     ``chosen`` returns the run that a page shows by default. ``on_url`` gets the address, including
     its token. ``port`` None is any port, and the default one of the applications. Raise InputError
-    if the library of Foxglove is not installed, RunError if the port is not available.
+    if the library of Foxglove is not installed, or the port is not available.
     """
     # Below loop, recorder and guardian; before a library starts threads, which inherit it.
     be_ordinary()

@@ -292,7 +292,7 @@ def read(path: Path, stretch: TimeRange | None = None) -> Recording:
     Raises:
         DataError: The file cannot be read, is not a valid recording, or has no sample in the range.
     """
-    (whole,) = _read(path, stretch, piece_samples=None)
+    (whole,) = _read(path, stretch, None, set())
     return stretch.cut(whole) if stretch else whole
 
 
@@ -308,10 +308,11 @@ class RecordingStream:
     def __init__(self, path: Path, stretch: TimeRange | None = None) -> None:
         self.path = path
         self.stretch = stretch
+        self._warned: set[str] = set()
 
     def __iter__(self) -> Iterator[Recording]:
         """Yield the pieces; raise DataError as :func:`read`, or if facts follow samples."""
-        pieces = _prefetched(_read(self.path, self.stretch, PIECE_SAMPLES))
+        pieces = _prefetched(_read(self.path, self.stretch, PIECE_SAMPLES, self._warned))
         return self.stretch.cut_pieces(pieces) if self.stretch else pieces
 
 
@@ -325,9 +326,12 @@ def _prefetched(pieces: Generator[Recording, None, None]) -> Iterator[Recording]
 
 
 def _read(
-    path: Path, stretch: TimeRange | None, piece_samples: int | None
+    path: Path, stretch: TimeRange | None, piece_samples: int | None, warned: set[str]
 ) -> Generator[Recording, None, None]:
-    """Yield pieces of at least that many samples, uncut; one piece if None."""
+    """Yield pieces of at least that many samples, uncut; one piece if None.
+
+    A warning is added to ``warned``, and is not repeated.
+    """
     try:
         with open_binary(path) as stream:
             places = places_of(stream, stretch) if stretch else None
@@ -351,5 +355,8 @@ def _read(
         if not live:
             problem = scan.describe()
             advice = " ('hilctl recover' makes it a whole file again, and keeps this one)"
-        _log.warning("%s: %s; %d samples are read%s", path, problem, builder.samples, advice)
+        text = f"{path}: {problem}; {builder.samples} samples are read{advice}"
+        if text not in warned:
+            warned.add(text)
+            _log.warning("%s", text)
     yield last

@@ -5,7 +5,7 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.device import Device, DeviceInfo, ReadableDevice
+from hilctl.base.device import Device, DeviceInfo, DeviceReadings, ReadableDevice
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.run.run_folder import held_devices
 
@@ -25,6 +25,7 @@ class Probed:
     details: dict[str, str]
     displacement_um: float | None  # None if the sensor is not available without a run
     output: float | None  # output in ``command_unit``; None if unknown
+    measured: float | None  # output as measured by the device; None if it is not
     command_unit: str
     faults: tuple[str, ...]  # implausible values, each with a possible cause
 
@@ -39,7 +40,7 @@ def probe(path: Path, settings: list[str]) -> Probed:
     loaded = load_experiment(path, settings)
     info = loaded.device.info
     with held_devices(info.holds):
-        displacement_um, output = _read(loaded, loaded.device)
+        displacement_um, output, measured = _read(loaded, loaded.device)
     return Probed(
         name=info.name,
         description=info.description,
@@ -49,17 +50,18 @@ def probe(path: Path, settings: list[str]) -> Probed:
         details=dict(info.details),
         displacement_um=displacement_um,
         output=output,
+        measured=None if math.isnan(measured) else measured,
         command_unit=info.command_unit,
         faults=judge(info, displacement_um, output),
     )
 
 
-def _read(loaded: LoadedExperiment, device: Device) -> tuple[float | None, float | None]:
+def _read(loaded: LoadedExperiment, device: Device) -> tuple[float | None, float | None, float]:
     if isinstance(device, ReadableDevice) and not device.info.simulated:
-        return device.look()
+        return DeviceReadings(*device.look())
     device.open(loaded.config.sample_rate_hz, loaded.config.block)
     try:
-        return None, device.output()
+        return None, device.output(), math.nan
     finally:
         device.close()
 

@@ -335,7 +335,14 @@ def _is_trusted(holder: tuple[int, int] | None) -> bool:
 
 
 def _in_use(name: str, holder: tuple[int, int] | None) -> InputError:
-    return InputError(f"{name} is in use by {_text_of(holder)}: wait for its end, or stop it first")
+    hint = "wait for its end, or stop it first"
+    if holder and holder[0] and not Path(f"/proc/{holder[0]}").exists():
+        hint = (
+            "its supervisor has ended, and its loop or guardian still sets the safe value. hilctl "
+            "status (with its HILCTL_RUNS) lists it; hilctl stop --run NAME ends the guardian, and "
+            "leaves the output as it is"
+        )
+    return InputError(f"{name} is in use by {_text_of(holder)}: {hint}")
 
 
 def _text_of(holder: tuple[int, int] | None) -> str:

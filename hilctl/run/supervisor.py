@@ -14,7 +14,7 @@ import time
 from collections.abc import Callable, Iterator, Mapping
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
-from functools import partial
+from functools import cache, partial
 from pathlib import Path
 from types import FrameType
 
@@ -210,6 +210,12 @@ class RunMonitor:
             page.put(PageField.STOP, Stop.RECORDER_FAILED if failed else Stop.RECORDER_STALLED)
 
 
+@cache
+def _warn_refused(line: str) -> None:
+    """Warn once per process: the runs of a study are refused the same."""
+    _log.warning("real time refused, ticks may be late: %s", line)
+
+
 def _refuse_suspend(number: int, frame: FrameType | None) -> None:
     """Explain in a thread why Ctrl-Z has no effect; the terminal may be blocked."""
     text = "Ctrl-Z cannot suspend a run: stop it with Ctrl-C; run --detach frees the terminal"
@@ -342,7 +348,7 @@ class Supervisor:
         set_up, refused = json.loads(page.read_text(PageSlot.SET_UP))
         info = self._checked.loaded.device.info
         for line in [] if info.simulated else refused:
-            _log.warning("real time refused, ticks may be late: %s", line)
+            _warn_refused(line)
         # The watchdog is armed between the start signal and sample 0.
         least_ns = _START_DELAY_NS + round(info.arm_s * 1e9)
         delay_ns = least_ns

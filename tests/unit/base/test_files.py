@@ -237,7 +237,9 @@ def test_the_file_that_is_likely_to_be_meant(tmp_path):
     assert meant.endswith(
         "terfenol_sine.yaml: no such file (did you mean 'terfenol_sine_6a.yaml'?)"
     )
-    assert no_such_file(tmp_path / "other.csv").endswith("other.csv: no such file")
+    assert "terfenol_sine_6a.yaml" in no_such_file(tmp_path / "terfenol_sine_6a")
+    for name in ("other.csv", "terfenol_sine_6a.html"):
+        assert no_such_file(tmp_path / name).endswith(f"{name}: no such file")
     (tmp_path / "link.csv").symlink_to("gone.csv")
     assert no_such_file(tmp_path / "link.csv").endswith("(it is a link to gone.csv)")
     lost = no_such_file(tmp_path / "lost" / "x.yaml")

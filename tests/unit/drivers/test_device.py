@@ -127,7 +127,7 @@ def test_closing_twice_says_goodbye_once():
 
 def test_looking_is_for_a_device_that_is_closed():
     device = NotingDac()
-    assert device.look() == (1.0, None)
+    assert device.look()[:2] == (1.0, None)
     device.broken = "look"
     with pytest.raises(DeviceError, match=r"dac at /dev/x: no answer \(to read the"):
         device.look()

@@ -11,6 +11,7 @@ from hilctl_drivers.profile_base import Range
 from hilctl_drivers.signal_chain import (
     AddressOptions,
     Amplifier,
+    Calibration,
     DacOptions,
     Sensor,
     SignalChain,
@@ -112,6 +113,14 @@ def test_hosts_are_names_or_addresses(host):
 def test_malformed_device_files_are_refused(path):
     with pytest.raises(ValidationError, match="device file"):
         AddressOptions.model_validate({"profile": "cobs_board", "serial_port": path})
+
+
+@pytest.mark.parametrize("date", ["soon", "15.1.2026"])
+def test_a_calibration_has_a_date(date):
+    note = {"by": "N. N.", "reference": "gauge block"}
+    assert Calibration.model_validate({**note, "date": "2026-01-15"}).date.year == 2026
+    with pytest.raises(ValidationError, match="date"):
+        Calibration.model_validate({**note, "date": date})
 
 
 def test_channels_are_found_by_name():

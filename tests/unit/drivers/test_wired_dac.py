@@ -323,7 +323,7 @@ def test_looking_changes_nothing(rig, kind):
     bench.device._block = 0
     bench.pass_s(6.0)  # each second takes the emulated rig time, too
     before = bench.events()
-    displacement_um, output = bench.device.look()
+    displacement_um, output, _ = bench.device.look()
     held = 3.0 if kind == "scpi" else 0.0  # tripped
     assert output == pytest.approx(held, abs=2e-3)
     assert displacement_um == pytest.approx(bench.emulator.device._rig.displacement_um, abs=0.5)

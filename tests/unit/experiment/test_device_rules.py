@@ -119,6 +119,7 @@ class TestConsistency:
         ("compensator", "settings", "error_um", "time_s"),
         [
             ("{model: models/terfenol_omega.yaml}", [], 33.75, 1e-3),
+            ("{model: models/terfenol_omega.yaml}", ["sample_rate_hz=10"], 33.75, 0.1),
             ("{model: models/terfenol_omega.yaml}", ["tracking_error_um=null"], None, None),
             ("{model: models/terfenol_omega.yaml}", ["tracking_error_um=5"], 5.0, None),
             ("none", [], None, None),
@@ -133,7 +134,7 @@ class TestConsistency:
         made = resolve(
             Document("x.yaml", text),
             Path(__file__).parents[3] / "configs",
-            [f"limits.{setting}" for setting in settings],
+            [s if "rate" in s else f"limits.{s}" for s in settings],
         )
         interlocks = made.config.interlocks
         assert (interlocks.tracking_error_um, interlocks.tracking_s) == (error_um, time_s)

@@ -17,7 +17,7 @@ import pytest
 from google.protobuf import descriptor_pb2, descriptor_pool, message_factory
 from websockets.asyncio.client import connect
 
-from hilctl.base.errors import InputError, RunError
+from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.live.foxglove import (
     DIAGNOSTICS,
@@ -246,7 +246,7 @@ def test_client_decodes_all_topics(description, tmp_path, monkeypatch):
 def test_port_in_use_is_an_error():
     server = FoxgloveServer(first, port=0)
     try:
-        with pytest.raises(RunError, match="in use"):
+        with pytest.raises(InputError, match="in use"):
             FoxgloveServer(first, port=int(server.url.rpartition(":")[2]))
     finally:
         server.run(lambda _: True)

@@ -14,7 +14,7 @@ from websockets.asyncio.client import connect
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from hilctl.base.errors import RunError
+from hilctl.base.errors import InputError, RunError
 from hilctl.live import server as module
 from hilctl.live.server import (
     FILES,
@@ -252,7 +252,7 @@ def test_both_addresses_of_loopback_are_served():
 def test_port_in_use_is_an_error():
     with socket.create_server(("127.0.0.1", 0)) as taken:
         port = taken.getsockname()[1]
-        with pytest.raises(RunError, match="in use"):
+        with pytest.raises(InputError, match="in use"):
             LiveServer(lambda runs: None, port)
 
 

@@ -12,7 +12,7 @@ from hilctl.base import private_dirs as locks
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockHeader
-from hilctl.recording.reader import read
+from hilctl.recording.reader import RecordingStream, read
 from hilctl.recording.recording_files import is_being_recorded, lock
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.writer import OutputFile
@@ -114,6 +114,9 @@ def test_reading_warns_and_writes_nothing(torn, caplog):
     (line,) = caplog.messages
     assert str(torn) in line
     assert "3000 samples" in line
+    stream = RecordingStream(torn)
+    assert len([*stream, *stream]) == 2
+    assert caplog.messages == [line] * 2  # once per stream
     caplog.clear()
     recover_recording(torn)
     read(torn)

@@ -64,7 +64,7 @@ class ProbedRig:
         section = {
             "name": "probed",
             "device": self.device,
-            "sample_rate_hz": 20,
+            "sample_rate_hz": 10,
             "waveform": {"kind": "hold", "unit": "A", "level": 0.0, "duration_s": 1.0},
             "compensator": "none",
             "limits": {"peak_current_a": 5.0, "slew_a_per_s": 500.0, "stroke_um": [-100.0, 100.0]},
@@ -77,7 +77,7 @@ class ProbedRig:
         chosen = device_class(self.device["kind"])
         section = {key: value for key, value in self.device.items() if key != "kind"}
         device = chosen(chosen.Options.model_validate(section))
-        device.open(20.0, 1)
+        device.open(10.0, 1)
         device.arm()
         device.exchange(0, np.array([command]), np.empty(1), np.empty(1))
         device._release()
@@ -88,13 +88,16 @@ def rig(tmp_path):
     """Return a function that puts an emulated device and an experiment on it together."""
     with ExitStack() as stack:
 
-        def of(profile, **device):
+        def of(profile, reader=None, **device):
             text = shipped_profiles()[profile].read_text(encoding="utf-8")
             path = tmp_path / "profile.yaml"
             path.write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"), encoding="utf-8")
             clock = ManualClock()
             wanted = EmulatorOptions(
-                str(path), log=tmp_path / "writes.jsonl", actuator=TerfenolOptions(noise=False)
+                str(path),
+                log=tmp_path / "writes.jsonl",
+                reader=reader,
+                actuator=TerfenolOptions(noise=False),
             )
             emulator = stack.enter_context(emulated(wanted, clock))
             return ProbedRig(emulator, clock, tmp_path, **device)
@@ -126,7 +129,14 @@ def test_reading_and_output_are_those_of_the_rig(rig, profile):
     found = probe(probed.experiment, [])
     assert found.output == pytest.approx(3.0, abs=1e-2)
     assert found.displacement_um == pytest.approx(20.0, abs=10.0)
+    assert found.measured is None
     assert probed.log.read_text() == writes
+
+
+def test_a_measured_output_is_read_too(rig):
+    probed = rig("kepco_bop", reader="agilent_34970a", measure="current")
+    probed.drive(3.0)
+    assert probe(probed.experiment, []).measured == pytest.approx(3.0, abs=1e-2)
 
 
 def test_a_wrong_word_order_is_found(rig):

@@ -277,7 +277,7 @@ def test_a_device_stays_held_when_the_folder_is_removed():
         refused(name, match="in use by process")
 
 
-def test_lock_lives_as_long_as_a_process_that_inherited_it():
+def test_lock_lives_as_long_as_a_process_that_inherited_it(monkeypatch):
     """The loop outlives its supervisor: nobody may have its device before it is safe."""
     name = f"{NAME}inherited"
     with held_devices((name,)) as locks:
@@ -285,6 +285,8 @@ def test_lock_lives_as_long_as_a_process_that_inherited_it():
             [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=locks
         )
     refused(name)
+    monkeypatch.setattr(run_folder_module, "_holder", lambda address: (2**22 + 1, os.geteuid()))
+    refused(name, match="hilctl stop --run")  # its supervisor is gone
     child.communicate(b"\n", timeout=30)
     hold(name)
 

@@ -340,7 +340,7 @@ def test_input_and_output_are_read(serve, profile, reader):
     served.device().make_safe(3.0)
     served.clock.pass_s(0.5)
     before = served.events()
-    displacement_um, output = served.device().look()
+    displacement_um, output, _ = served.device().look()
     assert output == pytest.approx(3.0, abs=0.02)
     assert 10.0 < displacement_um < 45.0
     assert served.events() == before
