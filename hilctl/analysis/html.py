@@ -1,8 +1,8 @@
 """Parts of self-contained pages without scripts; figures are SVG elements.
 
 Figures have the width of a journal's column and text of 8 points; on paper they are smaller, and a
-page has two columns, except for tables of five columns or more. In dark mode the lightness of
-figures is inverted.
+page has two columns, except for tables of six columns or more, or of five with long texts. In dark
+mode the lightness of figures is inverted.
 """
 
 import html
@@ -71,10 +71,10 @@ dt { font-weight: 600; break-after: avoid; } dd { margin: 0 0 .4rem 1rem; break-
 @page { margin: 12mm; }
 @media print { html { font-size: 8.5pt; } body { max-width: none; padding: 0; line-height: 1.3; }
   main { columns: 2; column-gap: 5mm; } .figures, .side { columns: auto; }
-  h1, main > p:not(h2 ~ p), h2:has(+ .wide th:nth-child(5)),
-  main > .wide:has(th:nth-child(5)) { column-span: all; }
+  h1, main > p:not(h2 ~ p), h2:has(+ .wide th:nth-child(6), + .wide .text ~ th:nth-child(5)),
+  main > .wide:has(th:nth-child(6), .text ~ th:nth-child(5)) { column-span: all; }
   h2 { break-after: avoid; margin-top: 0; padding-top: 1rem; }
-  tr, main > .wide:not(:has(th:nth-child(5))) { break-inside: avoid; }
+  tr, main > .wide:not(:has(th:nth-child(6), .text ~ th:nth-child(5))) { break-inside: avoid; }
   tr:nth-child(-n+2), tr:nth-last-child(2) { break-after: avoid; }
   th, td { padding: .1rem .6rem .1rem 0; }
   .side, .side section { margin: 0; break-inside: auto; } .figures svg { max-width: 66mm; }

@@ -148,6 +148,7 @@ class RunReader:
         page, rate_hz = self._page, self.description.sample_rate_hz
         outcome, tuned = page.outcome(), page.get(PageField.TUNE_WANTED)
         late = self._lateness.percentiles_us()
+        killed = "no outcome from the loop: see the report" if self.ended else ""
         ring_used = (page.get(PageField.HEAD) - page.get(PageField.TAIL)) / self._ring.slots
         gauges = self._headroom.gauges(late.get("max", 0.0) * 1e-6)
         gauges.append(Gauge("ring", ring_used, 100.0 * ring_used, 100.0, "%"))
@@ -155,7 +156,7 @@ class RunReader:
             "run": self.folder.card.name,
             "recording": self.folder.card.recording,
             "state": self.state,
-            "reason": outcome.reason if outcome else "",
+            "reason": outcome.reason if outcome else killed,
             "safe": outcome.safe if outcome else None,
             "ended": self.ended,
             "t_s": max(self._next_sample, 0) / rate_hz,

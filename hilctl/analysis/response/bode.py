@@ -144,8 +144,8 @@ def line_table(found: FrequencyResponse) -> tuple[tuple[str, ...], list[tuple[st
         (
             f"{hz[k]:.6g}",
             significant(float(size[k]), 4),
-            f"{relative[k]:.2f}",
-            f"{phase_deg[k]:.1f}",
+            f"{relative[k]:z.2f}",
+            f"{phase_deg[k]:z.1f}",
             f"{found.coherence[k]:.4f}",
         )
         for k in shown

@@ -733,13 +733,14 @@ function report() {
 // "0,5" and "0.5" are the same number; anything else is marked as invalid.
 function typed(id) {
   const text = $(id).value.trim().replace(",", ".");
-  const value = /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(text) ? Number(text) : NaN;
+  const value = /^[+-]?(\d+\.?\d*|\.\d+)(e[+-]?\d+)?$/i.test(text) && Number.isFinite(Number(text)) ? Number(text) : NaN;
   $(id).setCustomValidity(Number.isNaN(value) ? "a number such as 0.5 or 0,5" : "");
   return value;
 }
 
 // What "set" will send, before it is sent.
 function showChange() {
+  if (!status?.description) return;
   const { waveform_unit: what } = status.description;
   const parts = ["gain", "offset"].map((id) => [id, status[id], typed(id)]).filter(([, now, then]) => now !== then)
     .map(([id, now, then]) => `${id} ${now} → ${Number.isNaN(then) ? "not a number" : then}${id === "offset" ? ` ${what.replace("um", "µm")}` : ""}`);

@@ -24,7 +24,6 @@ from hilctl.studies.multi_run.run_plots import (
     loop_sheets,
     minor_loop_sheet,
     model_sheet,
-    note,
     spread,
     step_sheet,
 )
@@ -121,7 +120,8 @@ def draw_trends(axes: Axes, series: RunSeries, found: Sequence[Trend], *, fitted
     r2 = [trend.r2 for trend in found if trend.r2 is not None]
     if fitted and r2:
         texts = dict.fromkeys(f"{value:.4f}" for value in (min(r2), max(r2)))
-        note(axes, f"r² = {' to '.join(texts)}")
+        text, above = f"r² = {' to '.join(texts)}", (1.0, 1.02)  # of all points
+        axes.annotate(text, above, xycoords="axes fraction", ha="right", fontsize=7, color=QUIET)
     if logarithmic:
         axes.set_xscale("log")
         plain_numbers(axes)
