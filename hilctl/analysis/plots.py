@@ -314,6 +314,7 @@ def lateness(recording: Recording) -> FigureSpec | None:
             axes.axvline(half_us, color=MARK, linewidth=1.4, label="half a tick period")
         name = "time, µs (below 1 µs counts as 1)"
         axes.set(xscale="log", yscale="log", xlabel=name, ylabel="ticks")
+        axes.set_ylim(top=axes.get_ylim()[1] ** 1.6)  # the marks are above the bars
         plain_numbers(axes)
 
     caption = "Lateness of ticks, and duration of exchanges with the device."
