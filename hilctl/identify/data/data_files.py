@@ -292,7 +292,8 @@ def history_from_pieces(pieces: Iterable[Recording]) -> History:
         )
     signals = np.concatenate(indices), _joined(command), _joined(displacement_um)
     filled = _filled(piece.path, *signals, np.arange(begins_at, next_sample))
-    held = np.setdiff1d(np.arange(next_sample - begins_at), signals[0] - begins_at)
+    recorded = signals[0] - begins_at
+    held = np.setdiff1d(np.arange(next_sample - begins_at), recorded, assume_unique=True)
     return History(piece.path.name, *filled, piece.sample_rate_hz, conditioned, held)
 
 

@@ -114,7 +114,7 @@ class History:
 
     def rate(self) -> F64:
         """Return the rate of the motion, float64[n]; skipped ticks do not make it faster."""
-        kept = np.setdiff1d(np.arange(self.command.size), self.held)
+        kept = np.setdiff1d(np.arange(self.command.size), self.held, assume_unique=True)
         moved = np.interp(np.arange(self.command.size), kept, self.command[kept])
         return np.diff(moved, prepend=moved[0]) * self.sample_rate_hz
 

@@ -208,7 +208,7 @@ def _history(recording: Recording) -> History:
     one_sign = not begin[lowest] < begin[0] < begin[highest]
     at_rest = one_sign and recording.run.get("simulated") == "true"
     erased = 0 if at_rest else max(lowest, highest)
-    held = np.setdiff1d(np.arange(stop), recording.samples.index)
+    held = np.setdiff1d(np.arange(stop), recording.samples.index, assume_unique=True)
     label, rate_hz = recording.path.name, recording.sample_rate_hz
     return History(label, command, displacement_um, rate_hz, erased, held)
 
