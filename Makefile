@@ -5,7 +5,7 @@ VENV := .venv
 BIN := $(VENV)/bin
 PIP := $(BIN)/python -m pip --disable-pip-version-check
 
-.PHONY: run test test-slow test-long lint docs clean
+.PHONY: run test test-slow test-long lint docs packages clean
 
 run: $(VENV)/.core
 	$(BIN)/hilctl run configs/demo.yaml
@@ -15,8 +15,8 @@ test: $(VENV)/.ready
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.ready
-	@echo "Takes about 13 minutes on two cores: complete runs, in separate processes."
-	$(BIN)/pytest -n 2 --dist loadfile -m "slow and not long"
+	@echo "Takes about 10 minutes on two cores: complete runs, in separate processes, which often wait."
+	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m "slow and not long"
 
 test-long: $(VENV)/.ready
 	@echo "Takes more than half an hour: campaigns, published values, rigs of other physics."
@@ -48,6 +48,9 @@ $(VENV)/.core: pyproject.toml requirements.txt
 $(VENV)/.ready: $(VENV)/.core requirements-dev.txt
 	$(PIP) install --quiet --no-compile --require-hashes --requirement requirements-dev.txt
 	@touch $@
+
+packages: $(VENV)/.ready
+	.ci/packages
 
 clean:
 	rm -rf $(VENV) docs/_build docs/_generated .mypy_cache .pytest_cache .ruff_cache .import_linter_cache .hypothesis

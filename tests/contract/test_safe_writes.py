@@ -290,7 +290,7 @@ def answer_request(message, value):
 
 LINES = (lines, set_by_line, answer_line)
 REQUESTS = (requests, set_by_request, answer_request)
-LONGER = [pytest.param(count, marks=pytest.mark.slow) for count in (3, 5, 8)]
+LONGER = [pytest.param(count, marks=pytest.mark.slow) for count in (3, 8)]
 
 
 @pytest.mark.parametrize("forgets", [False, True])

@@ -11,7 +11,7 @@ from hilctl_drivers.simulated.devices import TerfenolOptions
 from hilctl_drivers.wired_dac import SerialDac, SerialOptions
 from tests.fakes import ShiftedClock, emulated, logged
 
-TIMEOUT_S = 2.0
+TIMEOUT_S = 1.0
 """A busy machine answers within it."""
 
 
