@@ -15,8 +15,8 @@ test: $(VENV)/.ready
 	$(BIN)/pytest -n auto --maxprocesses 4 --dist loadfile -m "not slow"
 
 test-slow: $(VENV)/.ready
-	@echo "Takes about 10 minutes on two cores: complete runs, in separate processes, which often wait."
-	$(BIN)/pytest -n 3 --dist loadfile --no-loadscope-reorder -m "slow and not long"
+	@echo "Takes about 12 minutes on two cores: complete runs, in separate processes."
+	$(BIN)/pytest -n 2 --dist loadfile --no-loadscope-reorder -m "slow and not long"
 
 test-long: $(VENV)/.ready
 	@echo "Takes more than half an hour: campaigns, published values, rigs of other physics."
