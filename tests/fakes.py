@@ -313,6 +313,18 @@ class VirtualTime:
         self.now_ns += max(0, round(seconds * 1e9))
 
 
+class AnsweringLink:
+    """A link that keeps what it was asked with, and answers with ``answer(request)``."""
+
+    def __init__(self, answer=None):
+        self.answer = answer
+        self.request, self.missing, self.usual = b"", None, 0
+
+    def transact(self, request, missing, usual=0):
+        self.request, self.missing, self.usual = bytes(request), missing, usual
+        return self.answer(self.request)
+
+
 class InProcessLink:
     """A :class:`~hilctl_drivers.transport.links.Link` that passes each request to emulated devices.
 

@@ -1,5 +1,6 @@
 """What holds for every message: it comes back as it was, and damage is never taken for a value."""
 
+import itertools
 import random
 import struct
 from collections import Counter
@@ -20,7 +21,7 @@ from pymodbus.pdu.register_message import (
 )
 
 from hilctl_drivers.ascii.ascii_session import LineFormat, parse_number
-from hilctl_drivers.modbus.modbus_session import RtuTransaction, TcpTransaction
+from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import (
     feedback_pdu,
     read_frame,
@@ -36,10 +37,13 @@ from hilctl_drivers.modbus.pdu import (
     write_single_pdu,
 )
 from hilctl_drivers.modbus.register_map import RegisterFormat
+from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.crc import CRCS
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import CorruptError, FrameError
+from tests.fakes import AnsweringLink
 
+PROFILE = load_profile("generic_float32")
 BINARY = [(kind, crc) for kind in ("cobs", "length") for crc in CRCS if crc != "none"]
 NUMPY = {
     "int16": ">i2", "uint16": ">u2", "int32": ">i4", "uint32": ">u4",
@@ -187,10 +191,20 @@ def assert_reads_reply(pdu, theirs, data):
     rtu = FramerRTU(DecodePDU(False)).buildFrame(theirs)
     assert reply_data(pdu, tcp_pdu(tcp, transaction, unit)) == data
     assert reply_data(pdu, rtu_pdu(rtu, unit)) == data
-    prepared = TcpTransaction(unit, pdu, transaction=(transaction - 1) % 65536)
-    prepared.request()
-    assert prepared.reply(tcp) == data
-    assert RtuTransaction(unit, pdu).reply(rtu) == data
+    for wire, reply in (("tcp", tcp), ("rtu", rtu)):
+        assert prepared(wire, unit, pdu, transaction)(reply) == data
+
+
+def prepared(wire, unit, pdu, number):
+    """Return what sends a prepared request of that number and reads the reply ``adu``."""
+    link = AnsweringLink()
+
+    def read(adu):
+        session = ModbusSession(PROFILE, link, unit, framing=wire)
+        session.numbers, link.answer = itertools.count(number), lambda _: adu
+        return session.prepare(pdu)()
+
+    return read
 
 
 # Damage: 20 000 corruptions of each kind of message, 400 000 in all
@@ -258,17 +272,14 @@ def modbus(wire, build):
         body = {3: b"\4" + data, 23: b"\4" + data, 76: data}.get(function, pdu[1:5])
         reply = bytes((function,)) + body
         number = rng.randrange(65536)
-        if wire == "rtu":
-            prepared, good = RtuTransaction(unit, pdu), rtu_adu(unit, reply)
-        else:
-            prepared = TcpTransaction(unit, pdu, transaction=(number - 1) % 65536)
-            good = tcp_adu(number, unit, reply)
-        prepared.request()
+        good = rtu_adu(unit, reply) if wire == "rtu" else tcp_adu(number, unit, reply)
 
         def plain(adu):
             return rtu_pdu(adu, unit) if wire == "rtu" else tcp_pdu(adu, number, unit)
 
-        return good, both_ways(prepared, lambda adu: reply_data(pdu, plain(adu)))
+        return good, both_ways(
+            prepared(wire, unit, pdu, number), lambda adu: reply_data(pdu, plain(adu))
+        )
 
     return make
 
@@ -282,7 +293,7 @@ def both_ways(prepared, plain):
         except FrameError:
             value = None
         try:
-            taken = prepared.reply(adu)
+            taken = prepared(adu)
         except FrameError:
             assert value is None
             raise

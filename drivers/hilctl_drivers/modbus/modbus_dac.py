@@ -119,7 +119,7 @@ class ModbusDac(ModbusDevice):
 
         def pair(data: bytes) -> float:
             found = reader.read()
-            writer.call(write, data)
+            write(data)
             return found
 
         return pair, False
@@ -145,10 +145,8 @@ class ModbusDac(ModbusDevice):
         pdu = combined_request(writer.profile, self._target, setup.input)
         if pdu is None:
             return None
-        transaction, decode = writer.prepare(pdu), writer.decoder(setup.input)
-        transact, usual = writer.link.transact, transaction.reply_size
-        request, missing, reply = transaction.request, transaction.missing, transaction.reply
-        return lambda data: decode(reply(transact(request(data), missing, usual)))
+        call, decode = writer.prepare(pdu), writer.decoder(setup.input)
+        return lambda data: decode(call(data))
 
 
 def _not_open(data: bytes) -> float:

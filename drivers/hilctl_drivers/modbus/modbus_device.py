@@ -13,6 +13,7 @@ from hilctl_drivers.modbus.modbus_session import (
     read_time,
     write_request,
 )
+from hilctl_drivers.modbus.pdu import rtu_adu
 from hilctl_drivers.modbus.register_map import ModbusStep, RegisterStep
 from hilctl_drivers.signal_chain import DacOptions
 from hilctl_drivers.transport.links import Link, RefusedError
@@ -169,7 +170,7 @@ class ModbusDevice(SteppedDac):
         assert isinstance(self._link, StreamLink)
         output = self._target
         pdu = write_request(self._writer.profile, output, output.format.encode(value))
-        self._link.send_now(self._writer.prepare(pdu).request())
+        self._link.send_now(rtu_adu(self._writer.unit, pdu))
 
     def _confirm(self, value: float) -> None:
         output = self._target

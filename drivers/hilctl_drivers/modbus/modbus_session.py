@@ -1,14 +1,16 @@
 """Session with a Modbus device: registers, steps, exchange times, and the requests of a tick.
 
-The requests of a tick are built once. A transaction keeps the constant part of its request and of
-its good reply. A tick adds transaction id, data and CRC, and compares. Only a reply that differs is
+The requests of a tick are prepared once, as functions that keep the constant parts of the request
+and of its good reply. A tick adds number, data and CRC, and compares. Only a reply that differs is
 parsed by :mod:`hilctl_drivers.modbus.pdu`, which raises the error.
 """
 
+import itertools
 import math
 import struct
 import time
 from collections.abc import Callable, Sequence
+from functools import partial
 from typing import Literal, TypeAlias, cast
 
 from hilctl.base.errors import DeviceError
@@ -27,138 +29,116 @@ from hilctl_drivers.modbus.register_map import (
 )
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
-from hilctl_drivers.transport.links import CorruptError, IncompleteError, Link, RefusedError
+from hilctl_drivers.transport.links import (
+    CorruptError,
+    IncompleteError,
+    Link,
+    RefusedError,
+)
 from hilctl_drivers.transport.wire_time import WireTime
+
+Call: TypeAlias = Callable[..., bytes]
+"""Send a prepared request and return the register bytes or packed bits that it reads.
+
+An argument replaces the register bytes that its PDU writes.
+"""
 
 _tcp_start = struct.Struct(">HH").unpack_from
 
 
-class _Prepared:
-    """A prepared request and the check of its reply; what is the same in all is kept."""
+def _tcp_call(session: "ModbusSession", pdu: bytes) -> Call:
+    """Return a function that sends a PDU by Modbus TCP, each time with the next number."""
+    unit, numbers, transact = session.unit, session.numbers, session.link.transact
+    data_at, (head, read_size) = modbus.DATA_AT.get(pdu[0], len(pdu)), modbus.reply_layout(pdu)
+    own, before = pdu[data_at:], modbus.tcp_adu(0, unit, pdu)[2 : modbus.TCP_HEAD + data_at]
+    echoes = pdu[0] == modbus.WRITE_REGISTER
+    head = modbus.tcp_adu(0, unit, head + bytes(read_size))[2 : modbus.TCP_HEAD + len(head)]
+    usual = 2 + len(head) + read_size
+    join = struct.Struct(f">H{len(before)}s{len(own)}s").pack
+    split = struct.Struct(f">H{len(head)}s{read_size}s").unpack
 
-    def __init__(self, adu: bytes, pdu: bytes, start: int) -> None:
-        """Take the first request, its PDU, and where in the request the PDU begins."""
-        self.pdu = pdu
-        """The first request; later ones differ in the data only."""
-        first = modbus.DATA_AT.get(pdu[0], len(pdu))
-        head, read_size = modbus.reply_layout(pdu)
-        self._last = adu
-        self._data = pdu[first:]
-        self._data_size = len(self._data)
-        self._before = adu[: start + first]
-        # The reply to a single write echoes all of the request.
-        self._echo = pdu[0] == modbus.WRITE_REGISTER
-        self._head = adu[:start] + head
-        self._read_size = read_size
-        self.reply_size = len(self._head) + read_size
-        """Bytes of a good reply."""
+    def call(data: bytes = own) -> bytes:
+        number = next(numbers) & 0xFFFF
+        request = join(number, before, data)
+        adu = transact(request, _tcp_missing, usual)
+        if echoes:  # the good reply is the request
+            if adu == request:
+                return b""
+        elif len(adu) == usual:
+            read: bytes
+            found_number, found, read = split(adu)
+            if found_number == number and found == head:
+                return read
+        return session.read_data(request[modbus.TCP_HEAD :], modbus.tcp_pdu(adu, number, unit))
 
-
-class TcpTransaction(_Prepared):
-    """A prepared Modbus TCP request; each has the next transaction id."""
-
-    def __init__(self, unit: int, pdu: bytes, transaction: int = 0) -> None:
-        """Prepare ``pdu`` for ``unit``; the first request's id is ``transaction`` + 1."""
-        super().__init__(modbus.tcp_adu(transaction, unit, pdu), pdu, modbus.TCP_HEAD)
-        self._unit = unit
-        self._transaction = transaction
-        self._before = self._before[2:]
-        length = (self.reply_size - 6).to_bytes(2, "big")
-        self._head = self._head[2:4] + length + self._head[6:]
-        self._join = struct.Struct(f">H{len(self._before)}s{self._data_size}s").pack
-        self._split = struct.Struct(f">H{len(self._head)}s{self._read_size}s").unpack
-
-    def request(self, data: bytes = b"") -> bytes:
-        """Return the next request; without ``data`` it writes those of the last call."""
-        if data:
-            self._data = data
-            if self._echo:
-                self._head = self._head[:-2] + data
-        self._transaction = transaction = (self._transaction + 1) & 0xFFFF
-        self._last = made = self._join(transaction, self._before, self._data)
-        return made
-
-    def reply(self, adu: Bytes) -> bytes:
-        """Return the register bytes in the reply to the last request, or raise FrameError."""
-        if len(adu) == self.reply_size:
-            transaction, head, read = self._split(adu)
-            if transaction == self._transaction and head == self._head:
-                return cast(bytes, read)
-        pdu = modbus.tcp_pdu(adu, self._transaction, self._unit)
-        return modbus.reply_data(self._last[modbus.TCP_HEAD :], pdu)
-
-    def missing(self, received: Bytes) -> int:
-        """Return the number of missing bytes; 0 if the reply is complete, or is no Modbus TCP."""
-        count = len(received)
-        if count <= modbus.TCP_HEAD:
-            return modbus.TCP_HEAD + 1 - count
-        protocol, length = _tcp_start(received, 2)
-        if protocol or length > modbus.PDU_MAX + 1:
-            return 0
-        return max(0, int(length) + 6 - count)
+    return call
 
 
-class RtuTransaction(_Prepared):
-    """A prepared Modbus RTU request; there is no id to tell a late reply by.
+def _tcp_missing(received: Bytes) -> int:
+    """Return the number of missing bytes; 0 if the reply is complete, or is no Modbus TCP."""
+    size = len(received)
+    if size <= modbus.TCP_HEAD:
+        return modbus.TCP_HEAD + 1 - size
+    protocol, length = _tcp_start(received, 2)
+    if protocol or length > modbus.PDU_MAX + 1:
+        return 0
+    return max(0, int(length) + 6 - size)
+
+
+def _rtu_call(session: "ModbusSession", pdu: bytes) -> Call:
+    """Return a function that sends a PDU by Modbus RTU; there is no number to tell a late reply by.
 
     CRCs of what never changes are computed once; the rest is taken two bytes at a time.
     """
+    unit, transact, table = session.unit, session.link.transact, MODBUS_WORDS
+    data_at, (head, read_size) = modbus.DATA_AT.get(pdu[0], len(pdu)), modbus.reply_layout(pdu)
+    own, before = pdu[data_at:], modbus.rtu_adu(unit, pdu)[: 1 + data_at]
+    echoes = pdu[0] == modbus.WRITE_REGISTER
+    head = before[:1] + head
+    before_crc, head_crc = crc16_modbus(before), crc16_modbus(head)
+    usual = len(head) + read_size + 2
+    join = struct.Struct(f"<{len(before)}s{len(own)}sH").pack
+    split = struct.Struct(f"<{len(head)}s{read_size}sH").unpack
+    written_words = struct.Struct(f"<{len(own) // 2}H").unpack
+    read_words = struct.Struct(f"<{read_size // 2}H").unpack
+    in_words = not echoes and read_size % 2 == 0  # bits may not be
+    missing = partial(_rtu_missing, usual)
 
-    def __init__(self, unit: int, pdu: bytes) -> None:
-        """Prepare ``pdu`` for ``unit``."""
-        super().__init__(modbus.rtu_adu(unit, pdu), pdu, 1)
-        self._unit = unit
-        self.reply_size += 2
-        self._before_crc = crc16_modbus(self._before)
-        self._head_crc = crc16_modbus(self._head)
-        self._join = struct.Struct(f"<{len(self._before)}s{self._data_size}sH").pack
-        self._split = struct.Struct(f"<{len(self._head)}s{self._read_size}sH").unpack
-        self._written_words = struct.Struct(f"<{self._data_size // 2}H").unpack
-        self._read_words = struct.Struct(f"<{self._read_size // 2}H").unpack
-        self._in_words = self._read_size % 2 == 0  # bits may not be
-
-    def request(self, data: bytes = b"") -> bytes:
-        """Return the next request; without ``data`` it writes those of the last call."""
-        if not data:
-            return self._last
-        table, crc = MODBUS_WORDS, self._before_crc
-        for word in self._written_words(data):
+    def call(data: bytes = own) -> bytes:
+        crc = before_crc
+        for word in written_words(data):
             crc = table[crc ^ word]
-        if self._echo:
-            self._head = self._head[:-2] + data
-            self._head_crc = crc16_modbus(self._head)
-        self._last = made = self._join(self._before, data, crc)
-        return made
-
-    def reply(self, adu: Bytes) -> bytes:
-        """Return the register bytes in the reply to the last request, or raise FrameError."""
-        if len(adu) == self.reply_size and self._in_words:
-            head, read, sent = self._split(adu)
-            if head == self._head:
-                table, crc = MODBUS_WORDS, self._head_crc
-                for word in self._read_words(read):
+        request = join(before, data, crc)
+        adu = transact(request, missing, usual)
+        if echoes and adu == request:
+            return b""
+        if in_words and len(adu) == usual:
+            read: bytes
+            found, read, sent = split(adu)
+            if found == head:
+                crc = head_crc
+                for word in read_words(read):
                     crc = table[crc ^ word]
                 if crc == sent:
-                    return cast(bytes, read)
-        if adu[: len(self._last)] == self._last and not self._echo:
+                    return read
+        if adu.startswith(request):
             raise CorruptError(
                 "the request came back before the reply: the adapter echoes, or receives what it "
                 "sends; set echo: true beside the address"
             )
-        missing = self.missing(adu)
-        if missing:
-            raise IncompleteError(f"{missing} more bytes belong to the reply")
-        return modbus.reply_data(self._last[1:-2], modbus.rtu_pdu(adu, self._unit))
+        if lacking := missing(adu):
+            raise IncompleteError(f"{lacking} more bytes belong to the reply")
+        return session.read_data(request[1:-2], modbus.rtu_pdu(adu, unit))
 
-    def missing(self, received: Bytes) -> int:
-        """Return the number of missing bytes; 0 if the reply is complete."""
-        count = len(received)
-        if count < modbus.RTU_SHORTEST:
-            return modbus.RTU_SHORTEST - count
-        return 0 if received[1] & 0x80 else max(0, self.reply_size - count)
+    return call
 
 
-Transaction: TypeAlias = TcpTransaction | RtuTransaction
+def _rtu_missing(usual: int, received: Bytes) -> int:
+    """Return the number of bytes missing of a reply that has ``usual`` bytes if it is good."""
+    size = len(received)
+    if size < modbus.RTU_SHORTEST:
+        return modbus.RTU_SHORTEST - size
+    return 0 if received[1] & 0x80 else max(0, usual - size)
 
 
 def read_request(profile: ModbusProfile, register: Register) -> bytes:
@@ -208,21 +188,19 @@ class ModbusSession:
         self._framing = framing
         self.unit = unit
         self._sleep = sleep
-        self._feedbacks = 0
+        self.numbers = itertools.count(1)
+        """Numbers of Modbus TCP requests."""
 
-    def prepare(self, pdu: bytes) -> Transaction:
-        """Return a request that can be sent many times."""
-        if self._framing == "tcp":
-            return TcpTransaction(self.unit, pdu)
-        return RtuTransaction(self.unit, pdu)
+    def prepare(self, pdu: bytes) -> Call:
+        """Return a function that sends a request, and can be called many times."""
+        return (_tcp_call if self._framing == "tcp" else _rtu_call)(self, pdu)
 
-    def call(self, transaction: Transaction, data: bytes = b"") -> bytes:
-        """Send a prepared request with register bytes to write; return those that were read."""
-        request, usual = transaction.request(data), transaction.reply_size
+    def read_data(self, request_pdu: bytes, reply_pdu: bytes) -> bytes:
+        """Return :func:`hilctl_drivers.modbus.pdu.reply_data`; a refusal names keys."""
         try:
-            return transaction.reply(self.link.transact(request, transaction.missing, usual))
+            return modbus.reply_data(request_pdu, reply_pdu)
         except RefusedError as error:
-            raise RefusedError(f"{error}{self._keys(transaction.pdu)}", error.code) from None
+            raise RefusedError(f"{error}{self._keys(request_pdu)}", error.code) from None
 
     def feedback(self, *frames: bytes) -> list[bytes]:
         """Execute frames with function 76 in one message; return the bytes of each read frame.
@@ -230,10 +208,8 @@ class ModbusSession:
         After a refusal of a frame, those before it may have been executed.
         """
         pdu = modbus.feedback_pdu(*frames)
-        transaction = TcpTransaction(self.unit, pdu, self._feedbacks)
-        self._feedbacks = (self._feedbacks + 1) & 0xFFFF
         words = "".join(f"{size}s" for size in modbus.feedback_sizes(pdu))
-        return list(struct.unpack(words, self.call(transaction)))
+        return list(struct.unpack(words, self.prepare(pdu)()))
 
     def _keys(self, pdu: bytes) -> str:
         """Return the keys of registers at the address of a request; none for functions 23, 76."""
@@ -248,12 +224,12 @@ class ModbusSession:
 
     def read_bytes(self, register: Register) -> bytes:
         """Return the content of a register as bytes; a bit as one byte, 0 or 1."""
-        data = self.call(self.prepare(read_request(self.profile, register)))
+        data = self.prepare(read_request(self.profile, register))()
         return bytes([data[0] & 1]) if register.type == "bit" else data
 
     def write_bytes(self, register: Register, data: bytes) -> None:
         """Write what :meth:`read_bytes` returns."""
-        self.call(self.prepare(write_request(self.profile, register, data)))
+        self.prepare(write_request(self.profile, register, data))()
 
     def held_data(self, output: ModbusOutput) -> bytes | None:
         """Return the register bytes that write what an output holds; None if not known."""
@@ -333,7 +309,7 @@ class ModbusSession:
         if words == source.words:
             request = self.prepare(read_request(self.profile, validity))
             # Afterwards: a reading that has become invalid in between is not used.
-            return lambda data: decode(data) if bits(self.call(request)) == valid else math.nan
+            return lambda data: decode(data) if bits(request()) == valid else math.nan
 
         def part(register: Register) -> slice:
             first = 2 * (self.profile.wire_address(register) - start)
@@ -345,7 +321,7 @@ class ModbusSession:
     def input_reader(self, source: ModbusInput) -> Callable[[], float]:
         """Return a function that reads an input, NaN if it is invalid."""
         request, decode = self.prepare(read_request(self.profile, source)), self.decoder(source)
-        return lambda: decode(self.call(request))
+        return lambda: decode(request())
 
     def set_digital(self, output: DigitalRegister, high: bool) -> None:
         """Write 1 or 0 to a digital output."""
@@ -364,7 +340,7 @@ class ModbusSession:
         place = f"{register.area} {register.address}"
 
         def check() -> None:
-            found = register.bits(self.call(request))
+            found = register.bits(request())
             if found:
                 raise RefusedError(f"the error register, {place}, holds {found:#x}", found)
 

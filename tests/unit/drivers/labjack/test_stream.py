@@ -11,6 +11,7 @@ from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import feedback_pdu, read_frame, reply_size, write_frame
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.transport.links import MismatchError, RefusedError
+from tests.fakes import AnsweringLink
 
 DOCUMENTED = {
     "SCANRATE_HZ": 4002, "NUM_ADDRESSES": 4004, "SETTLING_US": 4008, "RESOLUTION_INDEX": 4010,
@@ -105,20 +106,6 @@ def test_constants_stand_where_the_flash_map_says(form, channel, span):
     assert stream.calibration_span(form, 0x3C4000, channel) == span
 
 
-class Link:
-    """Keeps the request and answers with what a test wants."""
-
-    def __init__(self, answer):
-        self._answer = answer
-        self.request = b""
-
-    def transact(self, request, missing, usual=0):
-        self.request = bytes(request)
-        reply = self._answer(self.request)
-        assert missing(bytearray(reply)) == 0
-        return reply
-
-
 def answered(pdu, transaction=None, unit=1):
     """Return a link whose device answers with a PDU."""
 
@@ -126,7 +113,7 @@ def answered(pdu, transaction=None, unit=1):
         first = request[:2] if transaction is None else transaction.to_bytes(2, "big")
         return first + b"\0\0" + (len(pdu) + 1).to_bytes(2, "big") + bytes([unit]) + pdu
 
-    return Link(answer)
+    return AnsweringLink(answer)
 
 
 def session(link):

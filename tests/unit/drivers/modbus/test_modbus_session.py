@@ -1,5 +1,6 @@
 """A session with a reader on another module: self-test, steps, faults, and letting go."""
 
+import itertools
 import struct
 
 import pytest
@@ -10,8 +11,6 @@ from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 from hilctl_drivers.modbus.modbus_session import (
     ModbusReader,
     ModbusSession,
-    RtuTransaction,
-    TcpTransaction,
     exchange_time,
 )
 from hilctl_drivers.modbus.pdu import (
@@ -31,6 +30,7 @@ from hilctl_drivers.modbus.register_map import EnsureStep, ExpectStep, WriteStep
 from hilctl_drivers.profile import load_profile, parse_profile, with_link
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport import links
+from tests.fakes import AnsweringLink
 from tests.unit.drivers.modbus.conftest import exchange
 
 
@@ -400,59 +400,75 @@ ALL = pytest.mark.parametrize("case", CASES)
 BOTH = pytest.mark.parametrize("wire", ["tcp", "rtu"])
 
 
-def prepared(case, wire):
-    """Return a transaction, what wraps a reply, and the case."""
-    build, size = CASES[case][:2]
-    if wire == "rtu":
-        return RtuTransaction(17, build(OLD[:size])), lambda _, pdu: rtu_adu(17, pdu), CASES[case]
-    transaction = TcpTransaction(17, build(OLD[:size]))
-    return (
-        transaction,
-        lambda request, pdu: bytes(request[:2]) + tcp_adu(0, 17, pdu)[2:],
-        CASES[case],
-    )
+def session_on(link, wire, unit=17):
+    return ModbusSession(load_profile("generic_float32"), link, unit, framing=wire)
+
+
+class Prepared:
+    """A prepared request on a link that answers as told, and the case."""
+
+    def __init__(self, case, wire):
+        self.build, self.size, self.reply, self.read = CASES[case]
+        self.link, self.wire = AnsweringLink(), wire
+        self.call = session_on(self.link, wire).prepare(self.build(OLD[: self.size]))
+
+    def wrap(self, request, pdu):
+        """Return a reply to a request."""
+        if self.wire == "rtu":
+            return rtu_adu(17, pdu)
+        return bytes(request[:2]) + tcp_adu(0, 17, pdu)[2:]
+
+    def good(self, request):
+        return self.wrap(request, self.reply(NEW[: self.size]))
+
+    def answered(self, answer, *data):
+        """Return what is read if ``answer(request)`` comes back."""
+        self.link.answer = answer
+        return self.call(*data or [NEW[: self.size]])
 
 
 @ALL
 @BOTH
 def test_requests_are_those_of_the_plain_functions(case, wire):
-    transaction, _, (build, size, _, _) = prepared(case, wire)
-    plain = (
-        (lambda n, pdu: tcp_adu(n, 17, pdu)) if wire == "tcp" else (lambda _, pdu: rtu_adu(17, pdu))
-    )
-    wanted = [(b"", OLD), (NEW[:size], NEW), (b"", NEW), (OLD[:size], OLD)]
-    for number, (data, sent) in enumerate(wanted, start=1):
-        request = transaction.request(data)
-        assert request == plain(number, build(sent[:size]))
+    made = Prepared(case, wire)
+    for number, data in enumerate((OLD, NEW, OLD), start=1):
+        sent = data[: made.size]
+        made.answered(lambda request, sent=sent: made.wrap(request, made.reply(sent)), sent)
+        pdu = made.build(sent)
+        plain = tcp_adu(number, 17, pdu) if wire == "tcp" else rtu_adu(17, pdu)
+        assert made.link.request == plain
+    request = made.link.request
+    made.call()
+    assert made.link.request[2:-2] == request[2:-2]
 
 
 @ALL
 @BOTH
 def test_good_replies_are_read(case, wire):
-    transaction, wrap, (build, size, reply, read) = prepared(case, wire)
-    for data in (OLD[:size], NEW[:size]):
-        adu = wrap(transaction.request(data), reply(data))
-        assert transaction.reply_size == len(adu)
-        for buffer in (bytes, bytearray, memoryview):
-            assert transaction.reply(buffer(adu)) == read
-            assert type(transaction.reply(buffer(adu))) is bytes
-    assert transaction.reply_size == reply_size(build(OLD[:size])) + (7 if wire == "tcp" else 3)
+    made = Prepared(case, wire)
+    for buffer in (bytes, bytearray):
+        found = made.answered(lambda request, buffer=buffer: buffer(made.good(request)))
+        assert (found, type(found)) == (made.read, bytes)
+        assert made.link.usual == len(made.good(made.link.request))
 
 
 @ALL
 @BOTH
 def test_how_much_to_wait_for(case, wire):
-    transaction, wrap, (_, size, reply, _) = prepared(case, wire)
-    request = bytes(transaction.request(NEW[:size]))
-    refusal = wrap(request, bytes((reply(NEW[:size])[0] | 0x80, 2)))
-    for adu in (wrap(request, reply(NEW[:size])), refusal):
-        for cut in range(len(adu)):
-            assert 1 <= transaction.missing(adu[:cut]) <= len(adu) - cut
+    made = Prepared(case, wire)
+
+    def refusal(request):
+        return made.wrap(request, bytes((made.reply(NEW)[0] | 0x80, 2)))
+
+    for whole in (made.good, refusal):
+        size = len(whole(bytes(4)))
+        for cut in range(size):
             with pytest.raises(links.IncompleteError):
-                transaction.reply(adu[:cut])
-        assert transaction.missing(adu) == 0
+                made.answered(lambda request, cut=cut, whole=whole: whole(request)[:cut])
+            assert 1 <= made.link.missing(whole(made.link.request)[:cut]) <= size - cut
+        assert made.link.missing(whole(made.link.request)) == 0
     with pytest.raises(links.RefusedError) as caught:
-        transaction.reply(refusal)
+        made.answered(refusal)
     assert caught.value.code == 2
 
 
@@ -460,88 +476,98 @@ def test_how_much_to_wait_for(case, wire):
 @BOTH
 def test_each_flipped_bit_outside_the_data_is_seen(case, wire):
     """RTU sees every bit; TCP leaves data to TCP's own checksum and sees the rest."""
-    transaction, wrap, (_, size, reply, read) = prepared(case, wire)
-    good = wrap(transaction.request(NEW[:size]), reply(NEW[:size]))
-    data_from = len(good) - len(read) if wire == "tcp" else len(good)
-    for bit in range(8 * data_from):
-        bad = bytearray(good)
+    made = Prepared(case, wire)
+
+    def flipped(request, bit):
+        bad = bytearray(made.good(request))
         bad[bit // 8] ^= 1 << bit % 8
+        return bad
+
+    size = len(made.good(bytes(2)))
+    for bit in range(8 * (size - len(made.read) if wire == "tcp" else size)):
         with pytest.raises(links.FrameError):
-            transaction.reply(bad)
-    assert transaction.reply(good) == read
+            made.answered(lambda request, bit=bit: flipped(request, bit))
+    assert made.answered(made.good) == made.read
 
 
 @ALL
 def test_late_replies_are_not_taken_for_the_next(case):
     """TCP: a reply to the request before is a mismatch of transactions."""
-    transaction, wrap, (_, size, reply, _) = prepared(case, "tcp")
-    late = wrap(transaction.request(NEW[:size]), reply(NEW[:size]))
-    transaction.request(NEW[:size])
+    made = Prepared(case, "tcp")
+    made.answered(made.good)
+    late = made.good(made.link.request)
     with pytest.raises(links.MismatchError, match=r"transaction .*2, got 1"):
-        transaction.reply(late)
+        made.answered(lambda _: late)
 
 
-def test_single_write_must_echo_this_value():
+@BOTH
+def test_single_write_must_echo_this_value(wire):
     """On RTU an echo of the value before can't be told by an id, but by the value."""
-    for transaction, wrap in (prepared("single", wire)[:2] for wire in ("tcp", "rtu")):
-        transaction.request(b"ab")
-        request = bytes(transaction.request(b"cd"))
-        assert transaction.reply(wrap(request, H("06 0007") + b"cd")) == b""
+    made = Prepared("single", wire)
+    assert made.answered(lambda request: made.wrap(request, H("06 0007") + b"cd"), b"cd") == b""
+    for other in (b"ab", OLD[:2]):
         with pytest.raises(links.MismatchError, match="must begin with"):
-            transaction.reply(wrap(request, H("06 0007") + b"ab"))
+            made.answered(
+                lambda request, other=other: made.wrap(request, H("06 0007") + other), b"cd"
+            )
 
 
-def test_transaction_ids_wrap_and_are_in_the_reply():
+def test_numbers_wrap_and_are_shared_by_all_requests():
     """65535 is followed by 0."""
-    transaction = TcpTransaction(1, read_pdu(3, 0, 1), transaction=65534)
-    numbers = [int.from_bytes(transaction.request()[:2], "big") for _ in range(3)]
-    assert numbers == [65535, 0, 1]
-    assert transaction.reply(H("0001 0000 0005 01 03 02 0007")) == H("0007")
+    link = AnsweringLink(lambda request: request[:2] + H("0000 0005 01 03 02 0007"))
+    session = session_on(link, "tcp", unit=1)
+    session.numbers = itertools.count(65535)
+    calls = [session.prepare(read_pdu(3, 0, 1)) for _ in range(2)]
+    for call, number in zip(calls * 2, (65535, 0, 1, 2), strict=True):
+        assert call() == H("0007")
+        assert int.from_bytes(link.request[:2], "big") == number
 
 
 @BOTH
 def test_replies_of_another_length_are_refused(wire):
-    transaction, wrap, _ = prepared("read", wire)
-    request = bytes(transaction.request())
-    good = wrap(request, H("04 04 40200000"))
+    made = Prepared("read", wire)
     for pdu in (H("04 02 4020"), H("04 06 402000000000")):
         with pytest.raises((links.MismatchError, links.IncompleteError)):
-            transaction.reply(wrap(request, pdu))
-    for tail in (b"\0", b"\0\0", b"\x55", good):
+            made.answered(lambda request, pdu=pdu: made.wrap(request, pdu))
+    for tail in (b"\0", b"\0\0", b"\x55", b"again"):
         with pytest.raises((links.CorruptError, links.MismatchError)):
-            transaction.reply(good + tail)
+            made.answered(lambda request, tail=tail: made.good(request) + tail)
 
 
-def test_local_echo_of_an_adapter_is_named():
-    transaction = RtuTransaction(17, read_pdu(4, 0, 2))
-    echo = transaction.request()
-    for received in (echo + b"\x11", echo + rtu_adu(17, b"\4\4" + REPLY)):
+@pytest.mark.parametrize("case", ["read", "single", "write_read"])
+def test_local_echo_of_an_adapter_is_named(case):
+    made = Prepared(case, "rtu")
+    for tail in (b"\x11", rtu_adu(17, b"\4\4" + REPLY)):
         with pytest.raises(links.CorruptError, match="echo"):
-            transaction.reply(received)
+            made.answered(lambda request, tail=tail: request + tail)
 
 
-def test_nonsense_is_not_waited_for():
+def test_an_echo_as_long_as_the_reply_is_named():
+    """Two registers are written, six are read: 17 bytes each."""
+    call = session_on(AnsweringLink(bytes), "rtu").prepare(write_read_pdu(0, 6, 9, NEW))
+    with pytest.raises(links.CorruptError, match="echo"):
+        call()
+
+
+@pytest.mark.parametrize(
+    "nonsense",
+    ["0001 0000 F000 01 03 02", "0001 0000 0000 01 03 02", "0001 0100 0090 01 03 02"],
+)
+def test_nonsense_is_not_waited_for(nonsense):
     """A header that can't be Modbus is refused at once, not after its claimed 60 kB."""
-    transaction = TcpTransaction(1, read_pdu(3, 0, 1))
-    transaction.request()
-    for nonsense in (
-        "0001 0000 F000 01 03 02",
-        "0001 0000 0000 01 03 02",
-        "0001 0100 0090 01 03 02",
-    ):
-        assert transaction.missing(H(nonsense)) == 0
-        with pytest.raises(links.CorruptError):
-            transaction.reply(H(nonsense))
+    link = AnsweringLink(lambda _: H(nonsense))
+    with pytest.raises(links.CorruptError):
+        session_on(link, "tcp", unit=1).prepare(read_pdu(3, 0, 1))()
+    assert link.missing(H(nonsense)) == 0
 
 
 @pytest.mark.parametrize("function", [1, 2])
 def test_bits_of_an_odd_number_of_bytes_are_read(function):
     """17 bits are three bytes, which is no whole number of registers."""
-    reply = bytes((function, 3)) + H("A5 5A 01")
-    transaction = RtuTransaction(17, read_pdu(function, 0, 17))
-    transaction.request()
-    assert transaction.reply(rtu_adu(17, reply)) == H("A5 5A 01")
-    bad = bytearray(rtu_adu(17, reply))
-    bad[3] ^= 1
+    reply = rtu_adu(17, bytes((function, 3)) + H("A5 5A 01"))
+    link = AnsweringLink(lambda _: reply)
+    call = session_on(link, "rtu").prepare(read_pdu(function, 0, 17))
+    assert call() == H("A5 5A 01")
+    link.answer = lambda _: reply[:3] + bytes([reply[3] ^ 1]) + reply[4:]
     with pytest.raises(links.CorruptError):
-        transaction.reply(bad)
+        call()
