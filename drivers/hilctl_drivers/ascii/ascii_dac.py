@@ -6,7 +6,13 @@ from string import Formatter
 
 from hilctl.base.errors import UnconfirmedError
 from hilctl.base.types import F64
-from hilctl_drivers.ascii.ascii_profile import AsciiOutput, AsciiProfile, binary_format, fill
+from hilctl_drivers.ascii.ascii_profile import (
+    AsciiExchange,
+    AsciiOutput,
+    AsciiProfile,
+    binary_format,
+    fill,
+)
 from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
     exchange_time,
@@ -34,9 +40,13 @@ class AsciiDac(SteppedDac, SerialDac):
 
     def _prepare(self) -> None:
         super()._prepare()
-        setup = self._setup
+        setup, options, combined = self._setup, self._options, self._profile.exchange
+        own = None if setup.reads_elsewhere else (options.output, options.input)
+        self._combined: AsciiExchange | None = None
+        if combined != "none" and (combined.output, combined.input) == own:
+            self._combined = combined
         # Half duplex: what was asked last is answered before the safe value can go out.
-        write = exchange_time(self._profile, self._options.output, None)
+        write = exchange_time(self._profile, options.output, None)
         busy = self._own_time()
         if setup.shares_link or setup.aux or setup.digital_output:
             busy = setup.after_reading(busy)
@@ -65,7 +75,7 @@ class AsciiDac(SteppedDac, SerialDac):
         self._reader.begin()
         self._try_out_safe_value()
         self._writer.check_errors()  # after all steps: those without a reply leave theirs there
-        self.transactions = (1 if self._is_combined else 2) + self.measures
+        self.transactions = (2 if self._combined is None else 1) + self.measures
 
     def _arm_watchdog(self) -> None:
         self._run("arming")
@@ -75,8 +85,8 @@ class AsciiDac(SteppedDac, SerialDac):
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
         value = self._chain.output(command.item())
-        combined = self._profile.exchange
-        if combined != "none" and self._is_combined:
+        combined = self._combined
+        if combined is not None:
             text = self._writer.text(combined.write, value=self._target.number(value))
             number = reading(combined, partial(self._writer.ask, text))
             found = self._profile.inputs[combined.input].value(number)
@@ -106,13 +116,6 @@ class AsciiDac(SteppedDac, SerialDac):
     def _close(self) -> None:
         super()._close()
         self._writer.check_errors()
-
-    @property
-    def _is_combined(self) -> bool:
-        combined, options = self._profile.exchange, self._options
-        if combined == "none" or self._setup.reads_elsewhere:
-            return False
-        return (combined.output, combined.input) == (options.output, options.input)
 
     def _write(self, value: float) -> bool:
         """Write the output; return whether the answer shows that a device has received it."""

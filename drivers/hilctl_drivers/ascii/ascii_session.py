@@ -388,16 +388,15 @@ class AsciiSession:
                 raise DeviceError(f"{rule}, got {found:g}")
 
     def _check_trouble(self, text: str, reply: str) -> None:
-        text = printable(text)
         if self._refusal != "none" and self._refusal.match(reply):
             said = "ignored, the host watchdog has tripped: output is at its safe value"
-            raise WatchdogTrippedError(f"{text}: {said}", reply)
+            raise WatchdogTrippedError(f"{printable(text)}: {said}", reply)
         for error in self.profile.errors:
             if error.match(reply):
-                raise RefusedError(f"{text}: {error.meaning} ({reply})", reply)
+                raise RefusedError(f"{printable(text)}: {error.meaning} ({reply})", reply)
         who = _ADDRESSED.match(reply)
         if who and text[1:3] == f"{self.address:02X}" and who[1] != text[1:3]:
-            raise MismatchError(f"{text}: answered by address {who[1]}: {reply!r}")
+            raise MismatchError(f"{printable(text)}: answered by address {who[1]}: {reply!r}")
 
     def _check_echo(self, text: str, data: bytes | bytearray) -> bytes | bytearray:
         assert isinstance(self._replies, LineFormat)
