@@ -25,7 +25,7 @@ from hilctl_drivers.signal_chain import (
     check_watchdog,
     measuring_input,
 )
-from hilctl_drivers.transport.links import Link, naming
+from hilctl_drivers.transport.links import ErrorPrefix, Link
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 
@@ -40,7 +40,7 @@ class AuxSource:
 
     def value(self, reader: "SensorReader") -> float:
         """Return the value of the channel."""
-        with naming(f"aux.{self.channel.name}"):
+        with ErrorPrefix(f"aux.{self.channel.name}"):
             return self.scaled(reader.read())
 
     def scaled(self, reading: float) -> float:
@@ -290,7 +290,7 @@ class SensorReader(ABC):
     def open(self) -> None:
         """Connect and identify the device."""
         if self._name:
-            with naming(self._name):
+            with ErrorPrefix(self._name):
                 if self._own is not None:
                     self._own.open()
                 self._identify()
@@ -298,7 +298,7 @@ class SensorReader(ABC):
     def begin(self) -> None:
         """Run the init steps, and read once: a wrong input must show before the output moves."""
         if self._name:
-            with naming(self._name):
+            with ErrorPrefix(self._name):
                 self._set_up()
                 self._read()
 
@@ -307,13 +307,13 @@ class SensorReader(ABC):
 
     def read(self) -> float:
         """Return the value of the input in its unit."""
-        with naming(self._name):
+        with ErrorPrefix(self._name):
             return self._read()
 
     def end(self) -> None:
         """Run the close steps."""
         if self._name:
-            with naming(self._name):
+            with ErrorPrefix(self._name):
                 self._finish()
 
     def release(self) -> None:

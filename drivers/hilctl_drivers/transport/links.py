@@ -16,8 +16,7 @@ DeviceError
 """
 
 import math
-from collections.abc import Callable, Iterator, Mapping
-from contextlib import contextmanager
+from collections.abc import Callable, Mapping
 from types import MappingProxyType
 from typing import Protocol, TypeAlias
 
@@ -66,15 +65,19 @@ class Link(Protocol):
         """Close the link; closing twice is fine."""
 
 
-@contextmanager
-def naming(who: str) -> Iterator[None]:
-    """Prefix errors with the name of a device; an empty name changes nothing."""
-    try:
-        yield
-    except DeviceError as error:
-        if who:
-            raise DeviceError(f"{who}: {error}") from None
-        raise
+class ErrorPrefix:
+    """A context that prefixes errors with the name of a device; an empty name changes nothing."""
+
+    def __init__(self, who: str) -> None:
+        self._who = who
+
+    def __enter__(self) -> None:
+        """Enter it."""
+
+    def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
+        """Raise DeviceError in place of one without the name."""
+        if self._who and isinstance(error, DeviceError):
+            raise DeviceError(f"{self._who}: {error}") from None
 
 
 def why(error: OSError, remedies: Mapping[int, str] = MappingProxyType({})) -> str:
