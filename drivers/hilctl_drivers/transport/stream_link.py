@@ -126,13 +126,17 @@ class StreamLink(ABC):
             missing, usual = _behind(request, missing), 0
         reply: bytes | bytearray
         try:
-            if self._stale:
-                self.drain()
             self._count_waiting()
-            if self._waiting[0] or self._gap_s:
-                self._await_gap()
+            if self._waiting[0] or self._gap_s or self._stale:
+                self._settle()
             deadline = self._clock() + self.timeout_s
-            if self._write(request):
+            # Past pyserial, which takes three times as long; its flush() hangs on ptys and USB CDC.
+            try:
+                sent = write(self._fd, request)
+            except BlockingIOError:
+                sent = 0
+            if sent < len(request):
+                self._send(request[sent:])
                 usual = 0  # that took a part of the time-out
             if usual and self._poll.poll(self._timeout_ms):
                 reply = read(self._fd, _FIRST)
@@ -145,18 +149,6 @@ class StreamLink(ABC):
         if self._gap_s:
             self._quiet_at = self._clock() + self._gap_s
         return reply[len(request) :] if self._echo else reply
-
-    def _write(self, request: bytes | bytearray) -> bool:
-        """Send a request; return whether it had to wait for room."""
-        # Past pyserial, which takes three times as long; its flush() hangs on ptys and USB CDC.
-        try:
-            sent = write(self._fd, request)
-        except BlockingIOError:
-            sent = 0
-        if sent == len(request):
-            return False
-        self._send(request[sent:])
-        return True
 
     def send_now(self, request: bytes | bytearray) -> None:
         """Send ``request`` whatever is on the line, and await no answer.
@@ -197,7 +189,11 @@ class StreamLink(ABC):
         self.close()
         return LostError(f"{self.LOST} {why(error)}")
 
-    def _await_gap(self) -> None:
+    def _settle(self) -> None:
+        """Wait until the next request may be sent; raise DeviceError for unasked bytes."""
+        if self._stale:
+            self.drain()
+            self._count_waiting()
         if self._waiting[0]:
             raise DeviceError(
                 f"{self._waiting[0]} bytes that answer no request: another device sends, or the "
