@@ -141,7 +141,7 @@ STEEPEST = 5.0  # logarithm of the largest slope, of the mean
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Nodes of a table: lowest y and distance, middle of the band at each, and across the band."""
+    """Nodes of a table: lowest y and distance, centre of the band at each, and across the band."""
 
     lowest_um: float
     cell_um: float
@@ -180,6 +180,13 @@ class Layout:
         tilt = TILT * np.linspace(-1.0, 1.0, self.across)
         return np.stack([mean + tilt - 0.4 * TILT, mean - tilt - 0.4 * TILT])
 
+    def anhysteretic(self, logs: F64) -> F64:
+        """Return w at each node of y where both slopes are equal, in the inner half of the band."""
+        size = self.offsets.size
+        inner = slice(size // 4, size - size // 4)
+        uneven = np.maximum.accumulate(logs[0] - logs[1], axis=1)[:, inner]
+        return self.centre + [np.interp(0.0, row, self.offsets[inner]) for row in uneven]
+
     def moved(self, logs: F64, other: "Layout") -> F64:
         """Interpolate a table of another layout at the nodes of this one."""
         y = np.clip(self.nodes_um, other.nodes_um[0], other.nodes_um[-1])
@@ -192,8 +199,13 @@ class Layout:
         return np.stack([RegularGridInterpolator(axes, table)(places) for table in logs])
 
 
-def laid_over(paths: Sequence[Path], cells: int, across: int) -> Layout:
-    """Return a layout over the range of paths, with cells of y and across the band."""
+def laid_over(
+    paths: Sequence[Path], cells: int, across: int, line: tuple[F64, F64] | None = None
+) -> Layout:
+    """Return a layout over the range of paths, with cells of y and across the band.
+
+    The centre is a line through y and w, float64[k] each; the middle of the paths if None.
+    """
     w = np.concatenate([path.field for path in paths])
     y = np.concatenate([path.displacement_um for path in paths])
     edges = np.linspace(float(y.min()), float(y.max()), BINS + 1)
@@ -206,7 +218,7 @@ def laid_over(paths: Sequence[Path], cells: int, across: int) -> Layout:
     halves = 0.5 * (lows[seen] + highs[seen])
     room = MARGIN * float(np.ptp(y))
     nodes = np.linspace(float(y.min()) - room, float(y.max()) + room, cells + 1)
-    centre = _extended(nodes, middles, halves)
+    centre = _extended(nodes, *(line or (middles, halves)))
     least = FLATTEST * float(np.ptp(centre)) / cells
     centre = centre[0] + np.concatenate(([0.0], np.cumsum(np.maximum(np.diff(centre), least))))
     off = float(np.abs(w - np.interp(y, nodes, centre)).max())
@@ -314,7 +326,9 @@ class DuhemSearch:
 
     def _end(self, x: F64, logs: F64, before: Layout) -> DuhemEnd:
         """Search with a table of the requested size, from another table."""
-        self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_ROWS), *self._size))
+        # Slopes have a kink on the anhysteretic line, which nodes represent and cells would not.
+        line = before.nodes_um, before.anhysteretic(logs)
+        self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_ROWS), *self._size, line))
         x, logs = self._descend(x, self._layout.moved(logs, before), STEPS_FINE, FINE_GAIN)
         # The penalty leads here, but it is larger than the misfit of a wrong law of the losses.
         self._held = LOOSE**2

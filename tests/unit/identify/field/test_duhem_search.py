@@ -104,6 +104,15 @@ def test_the_centre_rises_though_loops_are_upright():
     assert (np.diff(here.centre) > 0.0).all()
 
 
+def test_the_centre_follows_the_line_of_equal_slopes():
+    here = layout()
+    equal = here.anhysteretic(logs_of(here))
+    most = here.offsets[-2]
+    assert equal - here.centre == pytest.approx(np.clip(0.02 * here.nodes_um, -most, most))
+    following = laid_over([loops()], 12, 6, (here.nodes_um, equal))
+    assert following.centre == pytest.approx(equal)
+
+
 def test_a_table_moved_to_other_nodes_is_the_same_function():
     coarse, fine = layout(12, 6), layout(20, 10)
     moved = fine.moved(logs_of(coarse), coarse)
@@ -261,7 +270,7 @@ def test_a_search_that_goes_on_from_a_rougher_one_ends_no_worse():
         np.std(job._errors(at.x, at.logs)) for job, at in ((whole, fine), (after, end))
     )
     assert end.logs.shape == fine.logs.shape
-    assert other < 1.1 * spread
+    assert other < 1.2 * spread  # each has the centre of its own earlier table
     assert end.offset_um == pytest.approx(fine.offset_um, abs=0.05)
 
 
