@@ -202,7 +202,8 @@ def settled_loops(limits: CharacterisationLimits, amplitude: float, line: F64) -
 
     ``line`` are commands at even steps of the displacement over the whole stroke, float64[k].
     """
-    # A small loop drifts in its first cycles. Random motions do not show where it settles.
+    # A small loop drifts in its first cycles. Random motions do not show where it settles. As in
+    # a run it starts within a cycle: the offset of its first cycle is that of the way to it.
     stroke = np.linspace(-1.0, 1.0, line.size)
     parts = []
     for hz in (limits.middle_hz, _RANDOM_BAND[1] * limits.highest_hz):
@@ -212,7 +213,7 @@ def settled_loops(limits: CharacterisationLimits, amplitude: float, line: F64) -
             most = _MOST_COMMAND * (middle[1] - middle[0])
             # A loop in saturation has other densities than a fit can have beside the rest.
             parts += [
-                sine(limits, 0.5 * (high - low), hz, 4.0, offset=0.5 * (low + high))
+                sine(limits, 0.5 * (high - low), hz, 4.0, offset=0.5 * (low + high), soft=1.0)
                 for low, high in ends
                 if high - low <= most
             ]
