@@ -248,7 +248,7 @@ def prior(layout: Layout) -> F64:
 
 
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # maximum distance of two points of a path, of the span
-COARSE_ROWS, FINE_ROWS = 4000, 7000
+COARSE_ROWS, FINE_ROWS = 4000, 12_000
 COARSE = (12, 8)  # cells of the first table
 FIRM, FIRMER = 100.0, 3000.0  # factors of the prior: for the first table, for its first steps
 TABLE_ALONE = 3  # first steps, with constant stages
