@@ -18,7 +18,7 @@ USUAL_MISSED_SHARE = 0.01
 """Default share of ticks that may be skipped."""
 
 _FOLLOW = 1.0 / 64.0
-_REMEDY = "lower sample_rate_hz, or see hilctl doctor"
+TIMING_REMEDY = "lower sample_rate_hz, or see hilctl doctor"
 _FEWEST_STALLS = 5  # a single stall, however long, does not end the run
 _TIMER_ABSTIME = 1
 
@@ -191,7 +191,7 @@ class Pacer:
         if len(self._stalls) >= _FEWEST_STALLS and self._missed > rules.max_missed:
             share = f"{self._missed} deadline misses up to tick {self.tick}"
             allowed = f"more than {rules.max_missed:.4g} in {rules.missed_window} ticks"
-            self._not_kept = f"timing not kept: {share}, {allowed}: {_REMEDY}"
+            self._not_kept = f"timing not kept: {share}, {allowed}: {TIMING_REMEDY}"
 
     def _follow(self) -> None:
         """Follow the device's clock: immediately if it is early, slowly if it is late."""

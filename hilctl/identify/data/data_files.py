@@ -204,7 +204,7 @@ def from_known_state(history: History) -> History:
     return replace(history, ignore=erased) if erased <= command.size // 2 else history
 
 
-_MOST_MISSING = 0.01  # share of samples
+MOST_MISSING = 0.01  # share of samples
 
 
 def without_gaps(
@@ -230,7 +230,7 @@ def _filled(
 ) -> tuple[F64, F64]:
     good = np.isfinite(displacement_um)
     missing = wanted.size - np.count_nonzero(good)
-    if missing > _MOST_MISSING * wanted.size:
+    if missing > MOST_MISSING * wanted.size:
         rule = f"{missing} of {wanted.size} samples are missing or have no displacement"
         raise DataError(f"{path}: {rule}: check late ticks and the sensor")
     if missing:

@@ -13,7 +13,9 @@ from hilctl.base.types import F64
 from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_before
 from hilctl.experiment.load import document_with, load_experiment
+from hilctl.identify.data.data_files import MOST_MISSING
 from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
+from hilctl.loop.pacer import TIMING_REMEDY
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import dump_model
 from hilctl.recording.reader import read
@@ -225,7 +227,13 @@ class CharacterisationRunner:
         raise_if_stopped(step.name, result)
         if result.code != "completed":
             raise _fault(step, result, read(path))
-        return read(path)
+        recording = read(path)
+        if (missing := _missing(recording)) > MOST_MISSING:
+            raise RunError(
+                f"{step.name}: timing not kept: {100.0 * missing:.2g} % of the samples are "
+                f"missing, more than {100.0 * MOST_MISSING:g} %: {TIMING_REMEDY}"
+            )
+        return recording
 
     def _kept(self, path: Path, settings: list[str]) -> Recording | None:
         """Return the recording of a step that is done; otherwise None.
@@ -239,7 +247,7 @@ class CharacterisationRunner:
             recording = read(path)
         except DataError:  # truncated before its first sample
             return None
-        if recording.end.get("code") != "completed":
+        if recording.end.get("code") != "completed" or _missing(recording) > MOST_MISSING:
             return None
         if RunKey.of_facts(recording.run) == RunKey.of(load_experiment(self._experiment, settings)):
             return recording
@@ -292,6 +300,12 @@ class CharacterisationRunner:
             settings.append(f"safe.at_start={self.limits.rest!r}")  # where the previous step ended
         # Noise common to all steps would be fitted.
         return settings + self._loaded.noise_settings(number)
+
+
+def _missing(recording: Recording) -> float:
+    """Return the share of samples that are missing, because their ticks were skipped."""
+    index = recording.samples.index
+    return 1.0 - index.size / (int(index[-1]) + 1 - int(index[0]))
 
 
 def _fault(step: CharacterisationStep, result: RunResult, recording: Recording) -> RunError:

@@ -4,10 +4,12 @@ import signal
 import time
 from dataclasses import replace
 
+import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.experiment.load import load_experiment
+from hilctl.recording.reader import read
 from hilctl.run.start import StepStoppedError, unpaced
 from hilctl.studies.characterise import characterisation_runner
 from hilctl.studies.characterise.characterisation_runner import (
@@ -89,6 +91,24 @@ def test_a_step_without_its_recording_is_run_again(experiment, size):
     rig = Rig()
     run(experiment, rig)
     assert rig.names == ["02-polarity-1.mcap"]
+
+
+def test_a_step_that_skips_ticks_is_run_again(experiment, monkeypatch):
+    def skipping(path):
+        whole = read(path)
+        kept = np.arange(whole.samples.index.size) % 50 > 0
+        return replace(whole, samples=whole.samples.rows(kept))
+
+    with monkeypatch.context() as patched:
+        patched.setattr(characterisation_runner, "read", skipping)
+        for _ in range(2):
+            rig = Rig()
+            with pytest.raises(RunError, match=r"rest: .* 2 % "):
+                run(experiment, rig)
+            assert rig.names == ["01-rest.mcap"]
+    rig = Rig()
+    run(experiment, rig)
+    assert "01-rest.mcap" not in rig.names
 
 
 def test_recordings_with_other_settings_are_not_replaced(experiment):
