@@ -140,7 +140,8 @@ def wired(case, tmp_path, stack):
 
     block = BLOCK if device.info.latency_blocks else 1
     made = DrivenSerial(device, block, rate_hz, lambda: rig.command, pass_time, name="serial_dac")
-    made.silent = silent and (line == "own" or profile.exchange == "none")
+    combined = getattr(profile.exchange, "write", "\n")  # of several lines the write is the last
+    made.silent = silent and (line == "own" or "\n" in combined)
     if case.endswith(" V"):
         made.reach = (device.info.command_min, device.info.command_max)
     made.must_be_at_rest = name in MUST_BE_AT_REST

@@ -292,7 +292,7 @@ def test_dcon_watchdog(profiles):
 
 
 @pytest.mark.parametrize(("name", "text"), [
-    ("kepco_bop", "CURR 1.000000;:MEAS:CURR?"), ("pi_e709", "SVA 1 1.0000\nPOS? 1"),
+    ("kepco_bop", "CURR 1.000000;:MEAS:CURR?"), ("pi_e709", "POS? 1\nSVA 1 1.0000"),
 ])  # fmt: skip
 def test_text_exchange(profiles, name, text):
     assert profiles[name].exchange.write.format(value=1.0) == text

@@ -339,7 +339,7 @@ def test_frames_of_one_write():
     asked = session(bytes.fromhex("a0341383110401000055"), profile=NPOINT)
     combined = NPOINT.exchange
     asked.ask(asked.text(combined.write, value=1000.0), combined)
-    assert asked.link.sent == [bytes.fromhex("a218128311e803000055a03413831155")]
+    assert asked.link.sent == [bytes.fromhex("a03413831155a218128311e803000055")]
     time = exchange_time(NPOINT, "axis1", "position1")
     assert time.what == "2 frames at 115200 8N1"
     assert wire_s(time) == pytest.approx((10 + 6 + 10) * 10 / 115200)
