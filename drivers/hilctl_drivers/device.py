@@ -280,8 +280,9 @@ class DacDevice(ABC):
         """Connect, and return displacement and output; :meth:`_release` follows."""
         raise DeviceError("it can't be read without being set up")
 
-    def _measure_output(self, measured: F64) -> None:  # noqa: B027  most devices do not measure
-        """Set ``measured[0]`` to the command as measured, if it is measured."""
+    def _measure_output(self, measured: F64) -> None:
+        """Set ``measured[0]`` to the command as measured; NaN if it is not measured."""
+        measured[0] = math.nan
 
     @abstractmethod
     def _exchange(
