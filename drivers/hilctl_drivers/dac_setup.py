@@ -66,7 +66,7 @@ class DacSetup:
     @classmethod
     def of(cls, options: DacOptions) -> Self:
         """Resolve options, or raise InputError if they do not fit their profiles."""
-        writer = Endpoint.of(options, options.timeout_s)
+        writer = Endpoint.of(options, options.reply_timeout_s)
         reader = reader_of(options, writer)
         there, here = reader.profile, writer.profile
         output = channel("output", options.output, here.outputs, here.title)
@@ -137,7 +137,7 @@ class DacSetup:
 
     def check_timeout(self, wire: WireTime) -> None:
         """Raise InputError if an answer cannot come within the timeout."""
-        timeout_s = self.options.timeout_s
+        timeout_s = self.options.reply_timeout_s
         if timeout_s <= wire.answered_s:
             raise InputError(f"timeout_s must be > {wire.answered_s:g}, got {timeout_s:g} ({wire})")
 

@@ -101,7 +101,7 @@ def reader_of(options: DacOptions, writer: Endpoint) -> Endpoint:
     if given is None:
         return writer
     if given.host or given.serial_port:
-        reader = Endpoint.of(given, options.timeout_s, "reader.")
+        reader = Endpoint.of(given, options.reply_timeout_s, "reader.")
         if set(reader.holds).isdisjoint(writer.holds):
             return reader
     else:
@@ -110,7 +110,7 @@ def reader_of(options: DacOptions, writer: Endpoint) -> Endpoint:
         port = int(writer.port) if writer.host else None
         where = {"host": options.host, "serial_port": options.serial_port, "tcp_port": port}
         place = given.model_copy(update={**where, "framing": framing})
-        reader = Endpoint.of(place, options.timeout_s, "reader.")
+        reader = Endpoint.of(place, options.reply_timeout_s, "reader.")
     return _on_the_line_of(writer, reader)
 
 

@@ -28,6 +28,7 @@ PROFILE = "name of a shipped profile, or path of your own relative to the experi
 _Channel = TypeVar("_Channel", bound=Range)
 _Value = TypeVar("_Value", float, F64)
 _SENSITIVITIES = {unit: f"um_per_{unit.lower()}" for unit in ("V", "mA", "um", "mm", "nm")}
+_TIMEOUT_S, _TIMEOUT_PERIODS = 0.1, 3.0
 _GAINS = ("gain_a_per_v", "gain_a_per_ma", "gain_v_per_v", "gain_v_per_ma")
 
 
@@ -293,8 +294,12 @@ class DacOptions(AddressOptions):
         description="device with the input, if it is another one; without host and serial_port it"
         " is on the line or connection of the output",
     )
-    timeout_s: float = Field(
-        default=0.1, gt=0.0, le=60.0, description="longest wait for a reply, s"
+    timeout_s: float | None = Field(
+        default=None,
+        gt=0.0,
+        le=60.0,
+        description="longest wait for a reply, s; default: 0.1, and three periods of a device slower"
+        " than 30 Hz",
     )
     amplifier: Amplifier | None = Field(
         default=None, description="omitted only if the output is in A and drives the coil"
@@ -329,6 +334,15 @@ class DacOptions(AddressOptions):
         if self.host is None is self.serial_port:
             raise ValueError("must have either host or serial_port")
         return self
+
+    @property
+    def reply_timeout_s(self) -> float:
+        """Longest wait for a reply, s."""
+        if self.timeout_s is not None:
+            return self.timeout_s
+        devices = (self.profile, *(() if self.reader is None else (self.reader.profile,)))
+        slowest_hz = min(each.profile.max_rate_hz for each in devices)
+        return max(_TIMEOUT_S, _TIMEOUT_PERIODS / slowest_hz)
 
     @property
     def watchdog_timeout_s(self) -> float | None:

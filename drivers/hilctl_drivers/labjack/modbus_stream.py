@@ -293,7 +293,7 @@ class ModbusStream(ModbusDevice):
         stream = StreamSession(
             writer,
             streaming,
-            self._options.timeout_s,
+            self._options.reply_timeout_s,
             profile.turnaround_s,
             self._sleep,
             self._clock,
