@@ -41,6 +41,7 @@ FLUX = slice(len(STAGES), len(STAGES) + POWERS.size)
 NAMES = (*STAGES, *(f"flux_{power:g}" for power in POWERS), "offset")
 """Search variables. The slope of the flux is exp(flux_1 n + flux_2 n^2 + ...), n from -1 to 1 over
 the stroke; the offset of the displacement at rest is relative to a first guess, in half strokes."""
+_OF_OPERATOR = [NAMES.index(name) for name in ("radian", "damping", "delay", "offset")]
 _FLUX, _OFFSET = 2.0, 0.5  # bounds
 _FLUX_NODES = 33
 
@@ -342,10 +343,12 @@ class DuhemSearch:
         self._signals.choose(x, way)
         paths = self._signals.paths(x)
         self._rows = chosen([path.motion for path in paths], rows)
+        self._count = self._rows.scale.size
         return paths
 
     def _lay(self, layout: Layout) -> None:
         self._layout = layout
+        self._fields: Latest[F64] = Latest()
         rows = prior(layout)
         self._smooth = self._prior = rows.T @ rows
 
@@ -401,7 +404,7 @@ class DuhemSearch:
         """Return the normal equations of a step (table first, then stages)."""
         size = logs.size
         slopes = np.empty((errors.size, size + (len(NAMES) if stages else 0)))
-        self._errors(x, logs, slopes[:, :size])
+        slopes[:, :size] = self._by_table(x, logs)
         for k in reversed(range(size, slopes.shape[1])):  # the offset first: paths are still cached
             there, stage = x.copy(), k - size
             if self._low[stage] == self._high[stage]:
@@ -419,33 +422,54 @@ class DuhemSearch:
             down[size:] -= self._held * (x - self._first) / STEPS
         return normal, down
 
-    def _errors(self, x: F64, logs: F64, slopes: F64 | None = None) -> F64:
+    def _errors(self, x: F64, logs: F64) -> F64:
         """Return weighted errors in percent of the stroke over the root of their number."""
-        # slopes: float64[N, 2 k l], filled with the derivatives by the logarithms.
+        # Most stages change the measured field alone.
+        key = x[_OF_OPERATOR].tobytes(), logs.tobytes()
+        fields = self._fields.of(key, lambda: self._followed(x, logs, np.empty((self._count, 0))))
+        return np.asarray(self._scale(x) * (fields - self._at_rows(x, "field")))
+
+    def _by_table(self, x: F64, logs: F64) -> F64:
+        """Return the derivatives of the errors by the logarithms: float64[N, 2 k l]."""
+        columns = np.empty((self._count, logs.size))
+        self._followed(x, logs, columns)
+        columns *= self._scale(x)[:, None]
+        return columns
+
+    def _scale(self, x: F64) -> F64:
+        """Return the weight of each row's field, in percent of the stroke: float64[N]."""
         layout = self._layout
-        start_um = self._signals.offset_um(x, self._first_um)
-        flux = np.arange(layout.centre.size, dtype=np.float64)  # not used by the inverse
-        band = layout.band(logs, flux)
-        to_percent = 100.0 / self._stroke_um / np.sqrt(self._rows.scale.size)
         middles = layout.nodes_um[:-1] + 0.5 * layout.cell_um
-        errors = np.empty(self._rows.scale.size)
+        slope = np.interp(self._at_rows(x, "displacement_um"), middles, layout.slopes)
+        to_percent = 100.0 / self._stroke_um / np.sqrt(self._count)
+        return np.asarray(to_percent * slope * self._rows.scale)
 
-        def fill(path: Path, rows: I64, first: int) -> None:
-            columns = np.empty((rows.size, 0 if slopes is None else logs.size))
-            w = np.empty_like(path.field)
-            duhem_columns(path.displacement_um, start_um, 0.0, band, rows, w, columns)
-            slope = np.interp(path.displacement_um[rows], middles, layout.slopes)
-            here = slice(first, first + rows.size)
-            scale = to_percent * slope * self._rows.scale[here]
-            errors[here] = scale * (w[rows] - path.field[rows])
-            if slopes is not None:
-                np.multiply(columns, scale[:, None], out=slopes[here])
+    def _at_rows(self, x: F64, signal: str) -> F64:
+        """Return a signal of the paths at all rows: float64[N]."""
+        parts = zip(self._signals.paths(x), self._rows.samples, strict=True)
+        return np.concatenate([getattr(path, signal)[rows] for path, rows in parts])
 
+    def _followed(self, x: F64, logs: F64, columns: F64) -> F64:
+        """Return the operator's field at all rows: float64[N].
+
+        ``columns`` is float64[N, m], filled with its derivatives by the logarithms; m may be 0.
+        """
+        start_um = self._signals.offset_um(x, self._first_um)
+        flux = np.arange(self._layout.centre.size, dtype=np.float64)  # not used by the inverse
+        band = self._layout.band(logs, flux)
         samples = self._rows.samples
-        firsts = np.cumsum([0, *(rows.size for rows in samples[:-1])]).tolist()
-        parts = zip(self._signals.paths(x), samples, firsts, strict=True)
-        parallel_map(lambda part: fill(*part), parts)
-        return errors
+        ends = np.cumsum([rows.size for rows in samples]).tolist()
+        fields = np.empty(self._count)
+
+        def follow(path: Path, rows: I64, end: int) -> None:
+            here = slice(end - rows.size, end)
+            w = np.empty_like(path.field)
+            duhem_columns(path.displacement_um, start_um, 0.0, band, rows, w, columns[here])
+            fields[here] = w[rows]
+
+        parts = zip(self._signals.paths(x), samples, ends, strict=True)
+        parallel_map(lambda part: follow(*part), parts)
+        return fields
 
 
 def _bounded_step(
