@@ -40,6 +40,7 @@ CASES = {
     "bk_precision_1785b A": ("bk_precision_1785b", "--reader", "capancdt_6200"),
 }
 """Words of ``hilctl init`` by the name of the case."""
+RESUMES = 12  # of a command whose step was ended by the machine
 
 
 class PathError(Exception):
@@ -67,16 +68,17 @@ def follow(name: str, words: Sequence[str], folder: Path) -> dict[str, Any]:
     answers: dict[str, Any] = {}
 
     def said(command: str, *more: str) -> Any:
-        with (folder / f"{command}.log").open("w") as log:
-            command_line = typed(command, *more, "--json")
-            done = subprocess.run(command_line, stdout=subprocess.PIPE, stderr=log, cwd=folder)
-        (folder / f"{command}.json").write_bytes(done.stdout)
-        if done.returncode:
-            text = (folder / f"{command}.log").read_text().strip()
-            raise PathError(f"{command}: {text[-300:]}")
-        answers[command] = json.loads(done.stdout)
-        print(f"{name}: {command}", flush=True)
-        return answers[command]
+        command_line = typed(command, *more, "--json")
+        for again in range(1 + RESUMES):
+            done = subprocess.run(command_line, capture_output=True, text=True, cwd=folder)
+            if done.returncode == 0:
+                print(f"{name}: {command}", f"({again} resumes)" * (again > 0), flush=True)
+                answers[command] = json.loads(done.stdout)
+                return answers[command]
+            print(f"{name}: {command}: {done.stderr[-400:]}", flush=True)
+            if "resumes" not in done.stderr:
+                break
+        raise PathError(f"{command}: {done.stderr[-400:]}")
 
     try:
         said("init", *words, "--output", "rig.yaml")

@@ -248,6 +248,18 @@ def prior(layout: Layout) -> F64:
     return np.vstack(parts)
 
 
+def fading(logs: F64) -> F64:
+    """Return monotonic logarithms: with w, rising branches get steeper and falling ones flatter.
+
+    So an error of the field fades; otherwise it would grow with each small loop.
+    """
+    ways = np.stack((logs[0], -logs[1]))
+    above = np.maximum.accumulate(ways, axis=2)
+    below = np.minimum.accumulate(ways[:, :, ::-1], axis=2)[:, :, ::-1]
+    middle = 0.5 * (above + below)
+    return np.stack((middle[0], -middle[1]))
+
+
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # maximum distance of two points of a path, of the span
 COARSE_ROWS, FINE_ROWS = 4000, 12_000
 COARSE = (12, 8)  # cells of the first table
@@ -289,7 +301,7 @@ class DuhemSearch:
         self._first = np.clip(FIRST, self._low, self._high)
         self._signals = Signals(data)
         self._size = cells, across
-        self._held = HELD**2
+        self._held, self._fades = HELD**2, False
         mean = np.log(data.stroke_um / (2.0 * data.reach))
         self._log_range = float(np.log(least)), float(mean + STEEPEST)
 
@@ -308,10 +320,12 @@ class DuhemSearch:
         # Without a strong prior, first steps bring slopes that few loops reach to extreme values,
         # from which the search does not return.
         self._hold(FIRMER)
+        self._fades = True
         x, logs = self._descend(x, logs, TABLE_ALONE, 0.0, stages=False)
         progress(0.1, "a coarse table")
         self._hold(FIRM)
         x, logs = self._descend(x, logs, STEPS_COARSE, COARSE_GAIN)
+        self._fades = False
         progress(0.5, "the table")
         return self._end(x, logs, self._layout)
 
@@ -323,6 +337,7 @@ class DuhemSearch:
         self._layout = end.layout
         self._first_um = self._rest_um(path)
         x[-1] = self._signals.offset_in(end.offset_um, self._first_um)
+        self._held = LOOSE**2
         return self._end(x, end.logs, end.layout)
 
     def _end(self, x: F64, logs: F64, before: Layout) -> DuhemEnd:
@@ -332,8 +347,9 @@ class DuhemSearch:
         self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_ROWS), *self._size, line))
         x, logs = self._descend(x, self._layout.moved(logs, before), STEPS_FINE, FINE_GAIN)
         # The penalty leads here, but it is larger than the misfit of a wrong law of the losses.
-        self._held = LOOSE**2
-        x, logs = self._descend(x, logs, STEPS_LOOSE, FINE_GAIN)
+        if self._held > LOOSE**2:
+            self._held = LOOSE**2
+            x, logs = self._descend(x, logs, STEPS_LOOSE, FINE_GAIN)
         offset_um = self._signals.offset_um(x, self._first_um)
         known, flux = self._signals.known(x), self._signals.flux(x)
         held = self._space.at_bound(stages_in(x[: len(STAGES)]))
@@ -393,7 +409,8 @@ class DuhemSearch:
     def _stepped(self, x: F64, logs: F64, step: F64) -> tuple[F64, F64]:
         table = logs + np.clip(step[: logs.size], -1.0, 1.0).reshape(logs.shape)
         stages = x + step[logs.size :] * STEPS if step.size > logs.size else x
-        return np.clip(stages, self._low, self._high), np.clip(table, *self._log_range)
+        table = np.clip(table, *self._log_range)
+        return np.clip(stages, self._low, self._high), fading(table) if self._fades else table
 
     def _cost(self, x: F64, logs: F64, errors: F64) -> float:
         held = logs.ravel() @ self._prior @ logs.ravel()
