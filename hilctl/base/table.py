@@ -15,7 +15,7 @@ import re
 from abc import ABC, abstractmethod
 from array import array
 from collections import Counter
-from collections.abc import Sequence
+from collections.abc import Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -155,11 +155,14 @@ class Table(ABC):
         """Return a column's base unit (s, um, A or V; empty if unknown) and its factor to it."""
         return known_unit(self._units[index]) or ("", 1.0)
 
-    def time(self) -> int | None:
-        """Return the index of the time column: ``t_s``, or the only one in s; otherwise None."""
-        if "t_s" in self.names:
-            return self.index("t_s")
-        found = [each for each in range(len(self.names)) if self.unit(each)[0] == "s"]
+    def only(self, usual: str, *units: str) -> int | None:
+        """Return the index of the column with the usual name, or the only one in one of the units.
+
+        Units are base units (s, um, A, V). Return None if there is no such column, or several.
+        """
+        if usual in self.names:
+            return self.index(usual)
+        found = [each for each in range(len(self.names)) if self.unit(each)[0] in units]
         return found[0] if len(found) == 1 else None
 
     @abstractmethod
@@ -243,7 +246,7 @@ class TextTable(Table):
         )
         self._rows = rows[first:]
         above = [cells for _, line in rows[:first][-2:] if (cells := self.cells(line))]
-        names, units = self._titles(above)
+        names, units = self._titles(above, chosen)
         if not names:
             comments = (self.cells(line[1:]) for _, line in lines if line[0] in _COMMENT)
             names = next((each for each in comments if len(each) == self._count), [])
@@ -263,13 +266,16 @@ class TextTable(Table):
             _value(cells[each], self._comma) is not None for each in numeric
         )
 
-    def _titles(self, above: list[list[str]]) -> tuple[list[str], list[str]]:
+    def _titles(
+        self, above: list[list[str]], numeric: Sequence[int]
+    ) -> tuple[list[str], list[str]]:
         """Return the names and units in the last two rows above the data."""
         above = [cells[: self._count] for cells in above if len(cells) >= self._count]
         if not above:
             return [], []
         *before, last = above
-        is_units = any(last) and all(known_unit(cell) is not None or not cell for cell in last)
+        cells = [cell for each in numeric if (cell := last[each])]
+        is_units = bool(cells) and all(known_unit(cell) is not None for cell in cells)
         if is_units and before:
             return before[-1], last
         return last, []
@@ -440,13 +446,32 @@ def _mat(path: Path) -> _Columns:
     from scipy.io import loadmat
 
     try:
-        stored = loadmat(path)
+        stored = loadmat(path, simplify_cells=True)
     except NotImplementedError:
         rule = "is of MATLAB 7.3, which is not read: save it with -v7, or as .csv or .parquet"
         raise InputError(f"{path}: {rule}") from None
     except Exception as error:  # noqa: BLE001  SciPy raises errors of many kinds on damaged files
         raise InputError(f"{path}: is not a MATLAB file (.mat): {error}") from None
-    return {name: each for name, each in stored.items() if isinstance(each, np.ndarray)}
+    return dict(_arrays("", stored))
+
+
+def _arrays(path: str, value: Any) -> Iterator[tuple[str, npt.NDArray[Any]]]:
+    """Yield the arrays of nested structures by their paths.
+
+    ControlDesk of dSPACE stores a signal as Data, with its Name and Unit in the same structure.
+    """
+    if isinstance(value, dict):
+        texts = (value.get(key) for key in ("Name", "Unit"))
+        name, unit = (text if isinstance(text, str) else "" for text in texts)
+        title = f"{name} [{unit}]" if name and unit else name
+        for key, each in value.items():
+            below = title if title and key == "Data" else f"{path}.{key}".lstrip(".")
+            yield from _arrays(below, each)
+    elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
+        for each in value:
+            yield from _arrays(path, each)
+    elif isinstance(value, np.ndarray):
+        yield path, value
 
 
 def _parquet(path: Path) -> _Columns:

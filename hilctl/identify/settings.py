@@ -169,11 +169,15 @@ class TableSettings(StrictModel):
     """How text tables are read; not used for recordings."""
 
     unit: CommandUnit | None = _of((), None, "Unit of the command.")
-    command_column: str | int = _of((), "current_a", "Column name, or number from 1.")
-    displacement_column: str | int = _of(
-        (), "displacement_um", "The same for the displacement in um."
+    command_column: str | int | None = _of(
+        (), None, "Column name, or number from 1; default: current_a, or the only one in A or V."
     )
-    time_column: str | int | None = _of((), None, "The same for the time in s; or set rate_hz.")
+    displacement_column: str | int | None = _of(
+        (), None, "The same for the displacement; default: displacement_um, or the only one in um."
+    )
+    time_column: str | int | None = _of(
+        (), None, "The same for the time; default: t_s, or the only one in s, without rate_hz."
+    )
     rate_hz: float | None = _of((), None, "Samples per second if there is no time column.", gt=0.0)
     command_scale: float | None = _of((), None, "Unit of the command per unit of its column.")
     displacement_scale: float | None = _of(

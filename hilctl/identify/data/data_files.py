@@ -39,17 +39,11 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
     """Read command and displacement from a table, see :func:`hilctl.base.table.open_table`.
 
     Raise DataError if a column is unknown or has the wrong unit, a value is not a finite number
-    (names ``file:line``), time steps are uneven, or not exactly one of ``time_column`` and
-    ``rate_hz`` is set.
+    (names ``file:line``), time steps are uneven, or settings are missing or contradict each other.
     """
     table = open_table(path, settings.skip_rows)
-    known = f"its columns are {', '.join(table.names)}"
-    if (settings.time_column is None) == (settings.rate_hz is None):
-        given = "neither" if settings.rate_hz is None else "both"
-        raise DataError(f"{path}: set either --time-column or --rate-hz (got {given}); {known}")
-    command = _column(table, settings.command_column, "--command-column")
-    output = _column(table, settings.displacement_column, "--displacement-column")
-    wanted, unit = [command, output], settings.unit or table.unit(command)[0]
+    command, output, *times = wanted = _columns(table, settings)
+    unit = settings.unit or table.unit(command)[0]
     if unit not in get_args(CommandUnit):
         unit = ""
     command_scale = _scale(table, command, unit, "--command-scale", settings.command_scale)
@@ -57,15 +51,14 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
     parts = [f"command {_called(table, command, unit)}"]
     parts += [f"displacement {_called(table, output, 'um')}"]
     per_s = 1.0
-    if settings.time_column is not None:
-        wanted.append(time := _column(table, settings.time_column, "--time-column"))
+    for time in times:
         per_s = _scale(table, time, "s", "--time-column", None)
         parts.insert(0, f"time {_called(table, time, 's')}")
     found = table.read(wanted, settings.first_row, settings.last_row)
     rate_hz = settings.rate_hz or found.sample_rate_hz(2, UNEVEN, per_s)
     signals = found.values[0] * command_scale, found.values[1] * scale
     history = History(path.name, *signals, rate_hz, settings.ignore)
-    if per_s == 1.0 and settings.rate_hz is None:
+    if per_s == 1.0 and times:
         _check_rate(path, rate_hz)
     if scale == 1.0 and settings.displacement_scale is None:
         _check_stroke(path, history)
@@ -94,7 +87,39 @@ def _check_stroke(path: Path, history: History) -> None:
         )
 
 
-def _column(table: Table, column: Column, option: str) -> int:
+def _columns(table: Table, settings: TableSettings) -> list[int]:
+    """Return the columns of command, displacement and, without a rate, time.
+
+    Raise DataError with the options of all that are not known.
+    """
+    named, shown = settings.command_column, settings.displacement_column
+    found = {
+        "--command-column": _column(table, named, "--command-column", "current_a", "A", "V"),
+        "--displacement-column": _column(
+            table, shown, "--displacement-column", "displacement_um", "um"
+        ),
+    }
+    if settings.rate_hz is None:
+        time = _column(table, settings.time_column, "--time-column", "t_s", "s")
+        found["--time-column or --rate-hz"] = time
+    elif settings.time_column is not None:
+        raise DataError(f"{table.path}: set either --time-column or --rate-hz (got both)")
+    missing = ", ".join(option for option, at in found.items() if at is None)
+    if missing:
+        names = ", ".join(f"{at}: {name}" for at, name in enumerate(table.names, start=1))
+        raise DataError(f"{table.path}: set {missing}, by name or number; its columns are {names}")
+    columns = [at for at in found.values() if at is not None]
+    if columns[0] == columns[1]:
+        rule = f"command and displacement are both column {table.names[columns[0]]}"
+        raise DataError(f"{table.path}: {rule}: set --command-column and --displacement-column")
+    return columns
+
+
+def _column(
+    table: Table, column: Column | None, option: str, usual: str, *units: str
+) -> int | None:
+    if column is None:
+        return table.only(usual, *units)
     try:
         return table.index(column)
     except DataError as error:

@@ -94,6 +94,18 @@ def test_arrays_of_other_programs(tmp_path, suffix):
         open_table(path)
 
 
+def test_signals_in_structures(tmp_path):
+    """The time of ControlDesk is one structure, its signals are an array of them."""
+    signals = [{"Name": "Model/AO", "Data": [1.0, 2.0, 3.0], "Unit": "V"},
+               {"Name": "Model/Gap", "Data": [[4.0, 5.0, 6.0]], "Unit": ""}]  # fmt: skip
+    stored = {"rec": {"X": {"Data": [0.0, 0.1, 0.2]}, "Y": signals, "Capture": {"Length": 3.0}}}
+    pytest.importorskip("scipy.io").savemat(tmp_path / "rec.mat", stored)
+    table = open_table(tmp_path / "rec.mat")
+    assert table.names == ["rec.X.Data", "Model/AO [V]", "Model/Gap"]
+    expected = [[0.0, 0.1, 0.2], [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
+    np.testing.assert_array_equal(table.read([0, 1, 2]).values, expected)
+
+
 SEPARATORS = {"comma": ",", "comma and blank": ", ", "semicolon": ";", "tab": "\t", "blanks": "   "}
 
 
@@ -229,6 +241,11 @@ INSTRUMENTS = {
         "0,1.5,0.25,\n1,1.6,0.5,\n2,1.7,0.75,\n",
         {"X": [0.0, 1.0, 2.0], "CH1": [1.5, 1.6, 1.7], "CH2": [0.25, 0.5, 0.75]},
         ["", "V", "V"],
+    ),
+    "rigol with empty cells": (
+        "X,CH1,Start,Increment,\nSequence,Volt,-1.0e-03,1.0e-03,\n0,1.5,,,\n1,1.6,,,\n",
+        {"X": [0.0, 1.0], "CH1": [1.5, 1.6]},
+        ["", "V"],
     ),
     "labview": (
         "LabVIEW Measurement\nSeparator\tTab\nDecimal_Separator\t,\n***End_of_Header***\n"

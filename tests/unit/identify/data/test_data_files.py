@@ -218,10 +218,30 @@ def test_units_are_those_of_the_columns(tmp_path):
 
 def test_rate_or_time_not_both(tmp_path):
     path = write(tmp_path, rows(","))
-    with pytest.raises(DataError, match="neither"):
+    with pytest.raises(DataError, match="--time-column or --rate-hz"):
         table(path, 2, 3)
     with pytest.raises(DataError, match="got both"):
         table(path, 2, 3, time_column=1, rate_hz=100.0)
+
+
+def test_columns_are_known_by_their_units(tmp_path):
+    lines = [f"{k / 200},{k},{2 * k},{3 * k}" for k in range(20)]
+
+    def read(head, **settings):
+        path = write(tmp_path, [head, *lines])
+        return read_table(path, TableSettings(**settings)).history
+
+    history = read("t [ms],input,gap [nm],drive [mA]")
+    np.testing.assert_allclose(history.command, 3e-3 * np.arange(20))
+    np.testing.assert_allclose(history.displacement_um, 2e-3 * np.arange(20))
+    assert history.sample_rate_hz == pytest.approx(2e5)
+    assert read("t_s,wanted_a,displacement_um,current_a").command[-1] == 57.0
+    with pytest.raises(DataError) as caught:
+        read("x,CH1,CH2,CH3")
+    for option in ("--time-column", "--rate-hz", "--command-column", "--displacement-column"):
+        assert option in str(caught.value)
+    with pytest.raises(DataError, match="both column sensor"):
+        read("t_s,drive,sensor [V],note", displacement_column=3)
 
 
 @pytest.mark.parametrize(
