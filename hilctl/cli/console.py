@@ -60,7 +60,8 @@ def table(
     made = Table(title=Text(title) if title else None, title_justify="left")
     for number, heading in enumerate(headings):
         justify: JustifyMethod = "left" if number == 0 or heading in left else "right"
-        made.add_column(Text(heading), justify=justify, no_wrap=not wrap, overflow="fold")
+        no_wrap = justify == "right" and not wrap  # a number must not be cut
+        made.add_column(Text(heading), justify=justify, no_wrap=no_wrap, overflow="fold")
     for row in rows:
         made.add_row(*map(Text, row))
     return made

@@ -26,7 +26,7 @@ from hilctl.base.events import adapted_text
 from hilctl.base.formatting import printable, unit_text
 from hilctl.cli.console import compile_progress, console, listing, progress_bar, table
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
-from hilctl.cli.output import print_json, print_result
+from hilctl.cli.output import Verbosity, print_json, print_result
 from hilctl.experiment.device_rules import interlock_context
 from hilctl.experiment.file import label_settings
 from hilctl.experiment.preflight import CheckedExperiment
@@ -215,6 +215,8 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
     terminal = console()
     colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
     terminal.print(Text(result.code, colour) + f": {result.reason}")
+    if Verbosity.quiet and result.code == "fault":  # the terminal discards all
+        print(f"hilctl: fault: {result.reason}", file=sys.stderr)
     if not result.safe:
         terminal.print(f"Not safe: {describe(result.output_state)}.", style="bold red")
     if result.guardian_active:

@@ -39,7 +39,7 @@ EXCEPTIONS = {
     1: "illegal function", 2: "illegal data address", 3: "illegal data value",
     4: "device failure", 5: "acknowledged, still working", 6: "device busy",
     8: "memory parity error", 10: "gateway path unavailable",
-    11: "gateway target does not answer",
+    11: "gateway target does not answer: check unit_id",
 }  # fmt: skip
 
 

@@ -9,7 +9,7 @@ from rich.console import Group
 from rich.table import Table
 from rich.text import Text
 
-from hilctl.cli.console import compile_progress, print_rich, progress_bar
+from hilctl.cli.console import compile_progress, print_rich, progress_bar, table
 from hilctl.cli.output import Verbosity, safe_streams
 
 
@@ -102,3 +102,12 @@ def test_compilation_is_not_shown_if_quiet_or_without_a_terminal(monkeypatch, qu
     with compile_progress():
         compile_something()
     assert stream.getvalue() == ""
+
+
+def test_narrow_tables_keep_their_numbers(monkeypatch, capsys):
+    monkeypatch.setenv("COLUMNS", "40")
+    label = "a label that is longer than the width"
+    print_rich(table("", ["loop", "peak %", "rms %"], [[label, "12.3456", "7.8901"]]))
+    printed = capsys.readouterr().out
+    assert "12.3456" in printed
+    assert "7.8901" in printed

@@ -16,6 +16,7 @@ from rich.console import Console
 from hilctl.analysis.report import summarize
 from hilctl.base.segments import Segment
 from hilctl.cli import run as module
+from hilctl.cli.output import Verbosity
 from hilctl.cli.run import print_run, render_report, report_of, run_mapping, run_progress
 from hilctl.run.result import RunResult
 from hilctl.run.safety.manual_safe import SafeResult
@@ -126,6 +127,14 @@ def test_unsafe_output_is_printed(capsys, safe):
     assert "fault: lost" in shown
     assert "no samples" in shown
     assert ("Not safe" in shown) is not safe
+
+
+def test_quiet_prints_a_fault(monkeypatch, capsys):
+    monkeypatch.setattr(Verbosity, "quiet", True)
+    print_run(ENDED, None)
+    assert capsys.readouterr().err == ""
+    print_run(replace(ENDED, code="fault", reason="lost"), None)
+    assert "lost" in capsys.readouterr().err
 
 
 def test_adaptation_is_printed_without_a_report(capsys):
