@@ -133,7 +133,7 @@ Shown = TypeVar("Shown", bound=type)
 def shown_briefly(kind: Shown) -> Shown:
     """Show the objects of a dataclass or a pydantic model in one line, in a notebook as a table.
 
-    Arrays and nested objects are named by type and size.
+    Arrays and nested objects are named by type and size; what is None or empty is omitted.
     """
 
     def text(self: Any) -> str:
@@ -151,7 +151,12 @@ def shown_briefly(kind: Shown) -> Shown:
 
 def _rows(shown: Any) -> list[tuple[str, str]]:
     names = getattr(type(shown), "model_fields", None) or [each.name for each in fields(shown)]
-    return [(name, _brief(getattr(shown, name))) for name in names]
+    values = ((name, getattr(shown, name)) for name in names)
+    return [(name, _brief(value)) for name, value in values if not _is_empty(value)]
+
+
+def _is_empty(value: object) -> bool:
+    return value is None or (isinstance(value, Sized) and len(value) == 0)
 
 
 def _brief(value: object) -> str:

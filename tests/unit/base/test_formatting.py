@@ -91,6 +91,8 @@ def test_results_are_shown_in_one_line_and_as_a_table():
         error_um: float
         values: object
         parts: tuple
+        note: str | None = None
+        marks: tuple = ()
 
     shown = Result("a<b", 1.23456789, np.zeros((3, 2)), (1, 2))
     expected = "Result(name='a<b', error_um=1.23457, values=<ndarray [3, 2]>, parts=<tuple of 2>)"
