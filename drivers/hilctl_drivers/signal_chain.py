@@ -229,7 +229,8 @@ class AddressOptions(DeviceOptions):
     @model_validator(mode="after")
     def _settings_go_with_their_place(self) -> Self:
         if self.host is not None and self.serial_port is not None:
-            raise ValueError("must have one of host and serial_port, not both")
+            rule = "must have one of host and serial_port, not both: set the other to null"
+            raise ValueError(rule)
         places = {
             "host": (self.host, ("tcp_port", "framing")),
             "serial_port": (self.serial_port, PORT),
