@@ -299,8 +299,8 @@ class DacOptions(AddressOptions):
         default=None,
         gt=0.0,
         le=60.0,
-        description="longest wait for a reply, s; default: 0.1, and three periods of a device slower"
-        " than 30 Hz",
+        description="longest wait for a reply, s; default: 0.1, and three periods of a device"
+        " slower than 30 Hz",
     )
     amplifier: Amplifier | None = Field(
         default=None, description="omitted only if the output is in A and drives the coil"
@@ -342,7 +342,7 @@ class DacOptions(AddressOptions):
         if self.timeout_s is not None:
             return self.timeout_s
         devices = (self.profile, *(() if self.reader is None else (self.reader.profile,)))
-        slowest_hz = min(each.profile.max_rate_hz for each in devices)
+        slowest_hz: float = min(each.profile.max_rate_hz for each in devices)
         return max(_TIMEOUT_S, _TIMEOUT_PERIODS / slowest_hz)
 
     @property
