@@ -66,7 +66,7 @@ class TableRows:
 
     Attributes:
         path: The file.
-        values: float64[columns, rows], all finite.
+        values: float64[columns, rows], all finite except missing ones.
         lines: int64[rows], the line of each row in the file, or its number from 1.
     """
 
@@ -167,11 +167,16 @@ class Table(ABC):
 
     @abstractmethod
     def read(
-        self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None
+        self,
+        columns: Sequence[int],
+        first_row: int = 1,
+        last_row: int | None = None,
+        gaps: int | None = None,
     ) -> TableRows:
         """Read some columns, by their indices from 0, of some rows, counted from 1; None for all.
 
-        Raise DataError if rows are missing or, with the row, if a value is not a finite number.
+        Values of column ``gaps`` may be missing, that is NaN or an empty cell; they are NaN. Raise
+        DataError if rows are missing or, with the row, if another value is not a finite number.
         """
 
 
@@ -183,20 +188,31 @@ class ArrayTable(Table):
         self._columns = list(columns.values())
 
     def read(
-        self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None
+        self,
+        columns: Sequence[int],
+        first_row: int = 1,
+        last_row: int | None = None,
+        gaps: int | None = None,
     ) -> TableRows:
         """Read some columns of some rows; see :meth:`Table.read`."""
         check_rows(self.path, self._columns[0].size, first_row, last_row)
         rows = slice(first_row - 1, last_row)
         values = np.array([self._columns[each][rows] for each in columns], dtype=np.float64)
-        bad = np.argwhere(~np.isfinite(values))
+        bad = np.argwhere(_invalid(values.T, columns, gaps))
         if bad.size:
-            column, row = bad[0]
+            row, column = bad[0]
             raise DataError(
                 f"{self.path}: row {first_row + row}: {self.names[columns[column]]}: must be a "
                 f"finite number, got {values[column, row]}"
             )
         return TableRows(self.path, values, first_row + np.arange(values.shape[1]))
+
+
+def _invalid(values: F64, columns: Sequence[int], gaps: int | None) -> npt.NDArray[np.bool_]:
+    """Return which values of columns, float64[rows, columns], are neither finite nor missing."""
+    bad = ~np.isfinite(values)
+    bad &= ~np.isnan(values) | (np.array(columns) != gaps)
+    return bad
 
 
 def check_rows(path: Path, count: int, first_row: int, last_row: int | None) -> None:
@@ -281,7 +297,11 @@ class TextTable(Table):
         return last, []
 
     def read(
-        self, columns: Sequence[int], first_row: int = 1, last_row: int | None = None
+        self,
+        columns: Sequence[int],
+        first_row: int = 1,
+        last_row: int | None = None,
+        gaps: int | None = None,
     ) -> TableRows:
         """Read some columns of some rows, see :meth:`Table.read`; other cells may have any content.
 
@@ -289,9 +309,9 @@ class TextTable(Table):
         """
         check_rows(self.path, len(self._rows), first_row, last_row)
         rows = self._rows[first_row - 1 : last_row]
-        table = self._values(rows, columns)
+        table = self._values(rows, columns, gaps)
         lines = np.array([number for number, _ in rows])
-        bad = np.argwhere(~np.isfinite(table))
+        bad = np.argwhere(_invalid(table, columns, gaps))
         if bad.size:
             row, column = bad[0]
             more = np.unique(bad[:, 0]).size - 1
@@ -300,7 +320,7 @@ class TextTable(Table):
             raise DataError(f"{self._place(lines[row], columns[column])}: {text}")
         return TableRows(self.path, np.ascontiguousarray(table.T), lines)
 
-    def _values(self, rows: list[tuple[int, str]], columns: Sequence[int]) -> F64:
+    def _values(self, rows: list[tuple[int, str]], columns: Sequence[int], gaps: int | None) -> F64:
         """Return the values, float64[rows, columns]; raise DataError at the first invalid one."""
         values = array("d")
         for number, line in rows:
@@ -310,6 +330,8 @@ class TextTable(Table):
                 raise DataError(f"{self.path}:{number}: {rule}: {_short(line)}")
             for column in columns:
                 value = _value(cells[column], self._comma)
+                if column == gaps and not cells[column]:
+                    value = np.nan
                 if value is None:
                     text = f"must be a finite number, got {_short(cells[column])}"
                     raise DataError(f"{self._place(number, column)}: {text}")

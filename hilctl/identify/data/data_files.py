@@ -54,10 +54,11 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
     for time in times:
         per_s = _scale(table, time, "s", "--time-column", None)
         parts.insert(0, f"time {_called(table, time, 's')}")
-    found = table.read(wanted, settings.first_row, settings.last_row)
+    found = table.read(wanted, settings.first_row, settings.last_row, gaps=output)
     rate_hz = settings.rate_hz or found.sample_rate_hz(2, UNEVEN, per_s)
-    signals = found.values[0] * command_scale, found.values[1] * scale
-    history = History(path.name, *signals, rate_hz, settings.ignore)
+    rows, missing = np.arange(found.lines.size), np.flatnonzero(np.isnan(found.values[1]))
+    signals = _filled(path, rows, found.values[0] * command_scale, found.values[1] * scale, rows)
+    history = History(path.name, *signals, rate_hz, settings.ignore, missing)
     if per_s == 1.0 and times:
         _check_rate(path, rate_hz)
     if scale == 1.0 and settings.displacement_scale is None:
@@ -259,7 +260,7 @@ def _filled(
         rule = f"{missing} of {wanted.size} samples are missing or have no displacement"
         raise DataError(f"{path}: {rule}: check late ticks and the sensor")
     if missing:
-        text = "the command is held and the displacement interpolated"
+        text = "the displacement is interpolated, and the command of skipped ticks is held"
         _log.warning("%s: %d of %d samples are missing: %s", path, missing, wanted.size, text)
     last = np.maximum(np.searchsorted(index, wanted, side="right") - 1, 0)
     filled_um = np.interp(wanted, index[good], displacement_um[good])

@@ -66,7 +66,7 @@ class History:
     sample_rate_hz: float
     ignore: int = 0  # samples at the start that are not evaluated
     held: I64 = field(default_factory=lambda: np.empty(0, np.int64))
-    """Samples of skipped ticks, in which the command was held."""
+    """Samples without a displacement; in those of skipped ticks the command was held."""
 
     def __post_init__(self) -> None:
         check_signals(self.label, self.command, self.displacement_um)

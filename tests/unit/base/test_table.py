@@ -12,7 +12,7 @@ from hilctl.base.table import Table, TableRows, TextTable, open_table
 class Names(Table):
     """Columns without rows; two may have the same name."""
 
-    def read(self, columns, first_row=1, last_row=None) -> TableRows:
+    def read(self, columns, first_row=1, last_row=None, gaps=None) -> TableRows:
         raise NotImplementedError
 
 
@@ -283,3 +283,17 @@ def test_gaps_are_counted(table):
     text = "t,x\n" + "".join(f"{k},{'nan' if k in (3, 4, 9) else k}\n" for k in range(20))
     place, rule = "t.csv:5: column 2 (x)", "must be a finite number, got nan"
     assert refusal(table(text).read, [1]) == f"{place}: {rule}; so in 2 more rows"
+
+
+@pytest.mark.parametrize("cell", ["", "nan"])
+def test_gaps_of_one_column_are_accepted(table, tmp_path, cell):
+    made = table("t,x,y\n" + "".join(f"{k},{cell if k == 3 else k},{k}\n" for k in range(20)))
+    expected = np.where(np.arange(20) == 3, np.nan, np.arange(20.0))
+    np.testing.assert_array_equal(made.read([0, 1], gaps=1).values[1], expected)
+    with pytest.raises(DataError, match=r"t.csv:5: column 2"):
+        made.read([0, 1], gaps=2)
+    np.savez(tmp_path / "t.npz", t=np.arange(20.0), x=expected)
+    arrays = open_table(tmp_path / "t.npz")
+    np.testing.assert_array_equal(arrays.read([0, 1], gaps=1).values[1], expected)
+    with pytest.raises(DataError, match="row 4: x"):
+        arrays.read([0, 1])

@@ -216,6 +216,17 @@ def test_units_are_those_of_the_columns(tmp_path):
         table(path, "current", "gap", time_column=1)
 
 
+def test_missing_displacements_are_interpolated(tmp_path):
+    lines = [f"{k / 200},{k % 50},{'' if 100 <= k < 103 else 2 * k}" for k in range(400)]
+    path = write(tmp_path, ["t_s,current_a,displacement_um", *lines])
+    history = read_table(path, TableSettings()).history
+    np.testing.assert_allclose(history.displacement_um, 2.0 * np.arange(400))
+    np.testing.assert_array_equal(history.held, [100, 101, 102])
+    path = write(tmp_path, ["t_s,current_a,displacement_um", *lines[:150]])
+    with pytest.raises(DataError, match="3 of 150 samples"):
+        read_table(path, TableSettings())
+
+
 def test_rate_or_time_not_both(tmp_path):
     path = write(tmp_path, rows(","))
     with pytest.raises(DataError, match="--time-column or --rate-hz"):
