@@ -197,23 +197,19 @@ class _SampledTicks:
         size = ticks.late_ns.size
         if size == 0:
             return
-        self._kept.append(_rows(ticks, np.arange(-self._seen % self._every, size, self._every)))
+        self._kept.append(ticks.rows(np.arange(-self._seen % self._every, size, self._every)))
         self._seen += size
-        latest = _rows(ticks, np.array([int(np.argmax(ticks.late_ns))]))
+        latest = ticks.rows(np.array([int(np.argmax(ticks.late_ns))]))
         if self._latest is None or latest.late_ns[0] > self._latest.late_ns[0]:
             self._latest = latest
         if sum(each.late_ns.size for each in self._kept) > _MOST_TICKS:
             self._every *= 2
             together = _together(self._kept)
-            self._kept = [_rows(together, np.arange(0, together.late_ns.size, 2))]
+            self._kept = [together.rows(np.arange(0, together.late_ns.size, 2))]
 
     def ticks(self) -> Ticks:
         if self._latest is None:
             return Ticks(*(np.empty(0, dtype=np.int64),) * 4)
         together = _together([*self._kept, self._latest])
         _, rows = np.unique(together.first_sample, return_index=True)
-        return _rows(together, rows)
-
-
-def _rows(ticks: Ticks, rows: I64) -> Ticks:
-    return Ticks(**{each.name: getattr(ticks, each.name)[rows] for each in fields(Ticks)})
+        return together.rows(rows)

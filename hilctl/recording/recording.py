@@ -4,6 +4,9 @@ from collections.abc import Mapping
 from dataclasses import dataclass, field, fields
 from pathlib import Path
 
+import numpy as np
+import numpy.typing as npt
+
 from hilctl.base.device import AuxChannel
 from hilctl.base.events import Event
 from hilctl.base.samples import Samples
@@ -28,6 +31,10 @@ class Ticks:
     deadline_ns: I64
     late_ns: I64
     exchange_ns: I64
+
+    def rows(self, chosen: I64 | npt.NDArray[np.bool_]) -> "Ticks":
+        """Return the ticks at indices, or those that a mask selects."""
+        return Ticks(*(getattr(self, name)[chosen] for name in TICK_COLUMNS))
 
 
 TICK_COLUMNS = tuple(each.name for each in fields(Ticks))

@@ -4,7 +4,7 @@ import math
 import zlib
 from bisect import bisect_right
 from collections.abc import Iterable, Iterator
-from dataclasses import dataclass, fields, replace
+from dataclasses import dataclass, replace
 from typing import BinaryIO
 
 from mcap.records import AttachmentIndex, Channel, ChunkIndex, McapRecord, Metadata, MetadataIndex
@@ -14,7 +14,7 @@ from hilctl.base.samples import LAST_SAMPLE
 from hilctl.base.segments import Segment
 from hilctl.recording.mcap_records import FOOTER_BYTES, LARGEST_BYTES, footer_of, records_from
 from hilctl.recording.metadata_keys import unsealed
-from hilctl.recording.recording import Recording, Ticks
+from hilctl.recording.recording import Recording
 from hilctl.recording.validation import RATES_HZ, number_of
 
 _END_OF_ANY_PART = {"code", "reason", "output_safe", "output_state", "ended", "recovered"}
@@ -86,7 +86,7 @@ class TimeRange:
             piece,
             samples=piece.samples.part(start, stop),
             segments=tuple(_cut(piece.segments, start, stop)),
-            ticks=Ticks(**{each.name: getattr(ticks, each.name)[within] for each in fields(ticks)}),
+            ticks=ticks.rows(within),
             starts=tuple(each for each in piece.starts if start <= each.sample < stop),
         )
 
