@@ -16,8 +16,10 @@ import numpy as np
 from hilctl.base.types import I64
 from hilctl.machine.procfs import CAP_IPC_LOCK, Finding, Machine
 from hilctl.machine.rt_setup import (
+    DMA_REMEDY,
+    GROUP_REMEDY,
     ISOLATED,
-    LIMITS_FILE,
+    MEMORY_REMEDY,
     PRIORITY_REMEDY,
     RT_PERIOD,
     RT_RUNTIME,
@@ -42,6 +44,7 @@ _LOGIND_FOLDERS = ("/usr/lib/systemd", "/usr/local/lib/systemd", "/run/systemd",
 """Folders of its settings; later ones take precedence."""
 _SYSTEM_USERS = 999
 _NO = {"no", "n", "false", "f", "off", "0"}
+_THIS_MACHINE = Machine()
 
 
 def preemption(machine: Machine) -> Finding:
@@ -67,8 +70,8 @@ def fifo(machine: Machine, settings: Realtime) -> Finding:
     """Check whether SCHED_FIFO is allowed at the requested priority."""
     wanted = settings.priority
     if rt_group_runtime_us(machine.read) == 0:
-        remedy = "write 950000 to its cpu.rt_runtime_us, or boot with rt_group_sched=0"
-        return Finding("SCHED_FIFO", "bad", "this control group has no real-time share", remedy)
+        text = "this control group has no real-time share"
+        return Finding("SCHED_FIFO", "bad", text, GROUP_REMEDY)
     if machine.capable(_CAP_SYS_NICE):
         return Finding("SCHED_FIFO", "ok", f"priority {wanted} allowed (CAP_SYS_NICE)")
     limit = machine.limit("Max realtime priority")
@@ -85,11 +88,9 @@ def locked_memory(machine: Machine) -> Finding:
     if machine.capable(CAP_IPC_LOCK):
         return Finding("locked memory", "ok", "any amount (CAP_IPC_LOCK)")
     if limit is None or limit >= _ENOUGH_LOCKED_BYTES:
-        return Finding(
-            "locked memory", "ok", "any amount" if limit is None else f"{limit >> 20} MB"
-        )
-    remedy = f"put '@realtime - memlock unlimited' into {LIMITS_FILE}, join that group, log in anew"
-    return Finding("locked memory", "bad", f"limit {limit >> 20} MB", remedy)
+        text = "any amount" if limit is None else f"{limit >> 20} MB"
+        return Finding("locked memory", "ok", text)
+    return Finding("locked memory", "bad", f"limit {limit >> 20} MB", MEMORY_REMEDY)
 
 
 def throttling(machine: Machine) -> Finding:
@@ -115,8 +116,7 @@ def dma_latency(machine: Machine) -> Finding:
         return Finding("idle states", "ok", f"no {DMA_LATENCY}: the kernel manages none")
     if machine.writable(path):
         return Finding("idle states", "ok", f"{DMA_LATENCY} can be held at 0")
-    remedy = 'a udev rule: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"'
-    return Finding("idle states", "warn", f"no permission for {DMA_LATENCY}", remedy)
+    return Finding("idle states", "warn", f"no permission for {DMA_LATENCY}", DMA_REMEDY)
 
 
 def isolated_cpus(machine: Machine, settings: Realtime) -> Finding:
@@ -365,13 +365,12 @@ def examine(machine: Machine, settings: Realtime, folder: Path) -> tuple[Finding
 
 
 def machine_facts(
-    settings: Realtime | None = None, folder: Path | None = None, machine: Machine | None = None
+    settings: Realtime, folder: Path, machine: Machine = _THIS_MACHINE
 ) -> dict[str, str]:
     """Return the results of all checks as metadata of a recording, such as ``machine.kernel``."""
-    found = examine(machine or Machine(), settings or Realtime(), folder or Path())
     return {
         f"machine.{each.name.replace(' ', '_').lower()}": f"{each.level}: {each.text}"
-        for each in found
+        for each in examine(machine, settings, folder)
     }
 
 

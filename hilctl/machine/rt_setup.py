@@ -27,6 +27,11 @@ PRIORITY_REMEDY = (
     "log in anew"
 )
 """What to do if SCHED_FIFO or a higher priority of the supervisor is refused."""
+GROUP_REMEDY = "write 950000 to its cpu.rt_runtime_us, or boot with rt_group_sched=0"
+MEMORY_REMEDY = (
+    f"put '@realtime - memlock unlimited' into {LIMITS_FILE}, join that group, log in anew"
+)
+DMA_REMEDY = 'a udev rule: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"'
 
 _HEAP_BYTES = 2 << 20
 _HEADROOM_BYTES = 256 << 20
@@ -81,15 +86,13 @@ def _step(name: str, detail: str, take: Callable[[], object], remedy: str = "") 
 
 def _lock_memory(system: LinuxProcess) -> SetUpStep:
     """Lock all memory, unless a later allocation would exceed the limit."""
-    remedy = f"put '@realtime - memlock unlimited' into {LIMITS_FILE}, join that group, log in anew"
     limit = system.lockable_bytes()
     needed = system.mapped_bytes() + _HEADROOM_BYTES
     if limit is not None and limit < needed:
         detail = f"only {limit >> 20} MB may be locked, {needed >> 20} MB are needed"
-        return SetUpStep("memory", "refused", detail, remedy)
-    return _step(
-        "memory", "locked: pages in RAM now, and those touched later", system.lock_memory, remedy
-    )
+        return SetUpStep("memory", "refused", detail, MEMORY_REMEDY)
+    detail = "locked: pages in RAM now, and those touched later"
+    return _step("memory", detail, system.lock_memory, MEMORY_REMEDY)
 
 
 def _pin(settings: Realtime, system: LinuxProcess) -> SetUpStep:
@@ -111,10 +114,7 @@ def _set_fifo(settings: Realtime, system: LinuxProcess) -> SetUpStep:
     except OSError as error:
         remedy = PRIORITY_REMEDY
         if rt_group_runtime_us(system.read) == 0:
-            remedy = (
-                "this control group has no real-time share: "
-                "write 950000 to its cpu.rt_runtime_us, or boot with rt_group_sched=0"
-            )
+            remedy = f"this control group has no real-time share: {GROUP_REMEDY}"
         return SetUpStep("fifo", "refused", f"SCHED_FIFO {priority}: {error.strerror}", remedy)
     return SetUpStep("fifo", "done", f"SCHED_FIFO {priority}{throttling and ', '}{throttling}")
 
@@ -148,7 +148,7 @@ def prepare(settings: Realtime, system: LinuxProcess = _THIS_PROCESS) -> tuple[S
             "dma_latency",
             f"{DMA_LATENCY} held at 0 us",
             lambda: system.hold_dma_latency(0),
-            'a udev rule: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"',
+            DMA_REMEDY,
         ),
         _pin(settings, system),
         _set_fifo(settings, system),
