@@ -1,19 +1,5 @@
 """Shared types, errors and file formats; imports no other room.
 
-types.py       array types, the unit of commands, arrays in chunks
-device.py      the contracts of a device and of a clock
-errors.py      all exceptions raised on purpose
-strict.py      base of all pydantic models
-files.py       text files read once, atomic writes, OS errors in words
-private_dirs.py  folders of one user, file locks
-samples.py     columns and flags of samples, blocks of samples
-events.py      events of a run
-segments.py    segments of a run and their steady cycles
-formatting.py  numbers with units, printable texts, JSON
-calibration.py  calibration files of sensor and amplifier
-table.py       tables of numbers: text, NumPy, MATLAB, Parquet
-yaml.py        strict YAML with the line of every value
-
 A device in another package needs ``Device``, ``DeviceInfo``, ``DeviceOptions``, ``DeviceError`` and
 ``UnconfirmedError`` only.
 """

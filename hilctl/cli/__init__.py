@@ -1,21 +1,5 @@
 """The command line: the only package that prints.
 
-commands.py       application and table of commands; imports a command's module when it is called
-options.py        options that several commands share
-output.py         standard streams: verbosity, escaped control characters, JSON
-console.py        tables, styled text and progress
-experiments.py    demo, examples, init, schema
-run.py            run, check, safe
-control.py        status, set, mark, stop
-live.py           watch, live
-recordings.py     list, export, recover
-reports.py        report, figures, replay
-models.py         identify, refine, compare, export-model
-campaigns.py      campaign, sweep, learn
-rig.py            calibrate, characterise
-responses.py      frf, spectrum, step, tune
-devices.py        doctor, devices
-
 Exit codes: 0 success; 1 a replay that differs, an incomplete export, a rate that this computer does
 not keep, or an invalid model; 2 invalid input, nothing has moved; 3 a run that ended by a fault, a
 device with implausible answers, or a rig that cannot be characterised; 128 + n a run stopped by

@@ -4,19 +4,6 @@ Rules: exact types in annotations, no globals, no objects; state is an argument,
 kernel and all kernels that it calls are in one file, because numba's on-disk cache does not detect
 a changed callee in another file. Kernels of models use only the syntax that
 :mod:`hilctl.models.kernel_translation` translates to C and MATLAB.
-
-jit.py           the decorator of all kernels
-hysteresis.py    play, stop and deadband operators, the integrated model
-implicit_models.py  Preisach, KP, Bouc-Wen and Duhem models with numeric inverses
-generalised_play.py  plays between envelopes
-generalised_duhem.py the generalised Duhem operator
-field.py         plays and drags of an effective field with losses
-residual_operator.py the residual of a modelled displacement
-gradient.py      adaptation by the gradient
-dynamics.py      field lag, structure, delay, creep, modes
-atomics.py       ordered loads and stores in shared memory
-limit.py         range and slew limits of a command
-interlock.py     interlocks of a run
 """
 
 import os

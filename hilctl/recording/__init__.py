@@ -1,17 +1,7 @@
 """MCAP recordings: writing, reading and recovery."""
 
 PUBLIC = (
-    "codec",
-    "encoder",
-    "metadata_keys",
-    "reader",
-    "recording",
-    "recording_files",
-    "recover",
-    "run_summary",
-    "schema",
-    "time_range",
-    "validation",
-    "writer",
-)
+    "codec", "encoder", "metadata_keys", "reader", "recording", "recording_files", "recover",
+    "run_summary", "schema", "time_range", "validation", "writer",
+)  # fmt: skip
 """Modules that other rooms import; the others are private."""

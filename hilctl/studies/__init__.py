@@ -1,11 +1,4 @@
-"""Experiments of several runs.
-
-step_runner.py  what campaign and characterisation share: host, disk space, cooling, progress
-calibrate.py    calibration of sensor and amplifier
-campaign/       runs of one experiment over a grid of parameters
-characterise/   measure a connected actuator, then identify and validate a model
-multi_run/      reports of many runs
-"""
+"""Experiments of several runs."""
 
 PUBLIC = (
     "calibrate", "campaign.campaign_runner", "campaign.plan", "campaign.steps", "campaign.store",

@@ -1,9 +1,4 @@
-"""Reference waveforms.
-
-spec.py           waveforms in the experiment file
-shapes.py         samples of one waveform
-build.py          a complete reference: files, soft starts and ends, sequences, segments
-"""
+"""Reference waveforms."""
 
 PUBLIC = ("build", "shapes", "spec")
 """Modules that other rooms import; the others are private."""
