@@ -344,7 +344,6 @@ class SessionReader(SensorReader):
     """A reader whose session runs the steps of a profile; each protocol has its session."""
 
     def __init__(self, setup: DacSetup, link: Link) -> None:
-        """See :class:`SensorReader`."""
         super().__init__(setup, link)
         self._session = self.session_on(setup.reader, self.link)
         self._read_input = self._session.input_reader(setup.input)

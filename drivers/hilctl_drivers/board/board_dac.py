@@ -70,7 +70,6 @@ class BoardReader(SensorReader):
     READS_ANY = False
 
     def __init__(self, setup: DacSetup, link: Link) -> None:
-        """See :class:`~hilctl_drivers.dac_setup.SensorReader`."""
         super().__init__(setup, link)
         profile = setup.reader.profile
         assert isinstance(profile, FrameProfile)

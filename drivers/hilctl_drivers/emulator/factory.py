@@ -105,20 +105,17 @@ class _Plan:
         source = reader.inputs[self._sensor]
         self.actuator, self.wiring = _rig(options, profile.outputs[self._output], source)
         markers = [getattr(source, key, None) for key in ("validity", "invalid", "valid")]
-        if set(markers) <= {"none", None} and any(
-            each.kind == "invalid" for each in options.faults
-        ):
+        faults = {each.kind for each in options.faults}
+        if set(markers) <= {"none", None} and "invalid" in faults:
             raise InputError(
                 f"fault invalid: {self._sensor} of {reader.title} has no validity, invalid or valid"
             )
-        stalls = any(each.kind == "stall" for each in options.faults)
-        if stalls and not isinstance(reader, StreamProfile):
+        if "stall" in faults and not isinstance(reader, StreamProfile):
             raise InputError(f"fault stall: {reader.title} does not send unasked")
         self._apart = reader is not profile and not self._may_share(options.reader_line)
         """Whether the reader is on a wire of its own."""
         self.reader_unit_id = self._unit_of_reader()
-        resets = any(fault.kind == "reset" for fault in options.faults)
-        if resets and not (self._served.tcp and self._shown.tcp):
+        if "reset" in faults and not (self._served.tcp and self._shown.tcp):
             raise InputError("fault reset is for tcp: a serial line has no connection to break")
 
     def _may_share(self, wanted: ReaderLine | None) -> bool:

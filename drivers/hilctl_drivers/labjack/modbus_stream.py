@@ -235,7 +235,6 @@ class ModbusStream(ModbusDevice):
         sleep: Callable[[float], None] = time.sleep,
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
-        """See :class:`~hilctl_drivers.wired_dac.WiredDac`."""
         super().__init__(options, link)
         self._sleep, self._clock = sleep, clock
         self._stream: StreamSession | None = None

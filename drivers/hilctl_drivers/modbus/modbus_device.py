@@ -31,7 +31,6 @@ class ModbusDevice(SteppedDac):
     _writer: ModbusSession
 
     def __init__(self, options: DacOptions, link: Link | None = None) -> None:
-        """See :class:`~hilctl_drivers.wired_dac.WiredDac`."""
         profile = options.profile.profile
         if not isinstance(profile, ModbusProfile):
             name = options.profile.name

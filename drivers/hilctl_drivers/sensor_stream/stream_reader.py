@@ -104,7 +104,6 @@ class StreamReader(SensorReader):
     READS_ANY = False
 
     def __init__(self, setup: DacSetup, link: Link) -> None:
-        """See :class:`~hilctl_drivers.dac_setup.SensorReader`."""
         super().__init__(setup, link)
         self._profile = cast(StreamProfile, setup.reader.profile)
         self._source = cast(StreamInput, setup.input)
