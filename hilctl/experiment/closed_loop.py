@@ -222,10 +222,12 @@ def bandwidth_of(kind: str, ki_per_s: float, rate_hz: float) -> float:
     return rate_hz / math.pi * math.asin(min(0.5 * ki_per_s / rate_hz, 1.0))
 
 
-def rounded_down(value: float) -> float:
-    """Return a value > 0 rounded down to three digits."""
-    unit = 10.0 ** (math.floor(math.log10(value)) - 2)
-    return float(f"{math.floor(value / unit) * unit:.3g}")
+def rounded_down(value: float, digits: int = 3) -> float:
+    """Return a value rounded towards zero, because a limit must not grow."""
+    if value == 0.0:
+        return 0.0
+    step = 10.0 ** (math.floor(math.log10(abs(value))) - digits + 1)
+    return float(f"{math.trunc(value / step + math.copysign(1e-9, value)) * step:.12g}")
 
 
 OFFSET_SHARE = 0.1

@@ -18,6 +18,7 @@ from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, commented, dump
+from hilctl.experiment.closed_loop import rounded_down
 from hilctl.experiment.devices import (
     describe,
     is_path,
@@ -182,7 +183,7 @@ def _first_values(info: DeviceInfo, limits: object) -> tuple[dict[str, Any], dic
     data["limits"], of_limits = _limits(info, low, high, slew)
     data["safe"] = {
         "value": 0.0 if low <= 0.0 <= high else low,
-        "ramp_s": _rounded(1.0 / (math.pi * frequency_hz), 1),
+        "ramp_s": rounded_down(1.0 / (math.pi * frequency_hz), 1),
     }
     remarks["safe.value"] = f"{info.command_unit} at which nothing can happen; every run ends there"
     remarks["safe.ramp_s"] = "from the limit to there"
@@ -193,7 +194,7 @@ def _range_of(limits: object, info: DeviceInfo) -> tuple[float, float]:
     """Return the range that the limits set, or a share of the device's."""
     if (stated := limited_range(limits)) is not None:
         return stated
-    low, high = (_rounded(_SHARE * each, 2) for each in (info.command_min, info.command_max))
+    low, high = (rounded_down(_SHARE * each, 2) for each in (info.command_min, info.command_max))
     return low, high
 
 
@@ -209,8 +210,8 @@ def _sine(unit: CommandUnit, low: float, high: float, frequency_hz: float) -> di
     return {
         "kind": "sine",
         "unit": unit,
-        "amplitude": _rounded(0.5 * min(high - offset, offset - low), 2),
-        "offset": _rounded(offset, 2),
+        "amplitude": rounded_down(0.5 * min(high - offset, offset - low), 2),
+        "offset": rounded_down(offset, 2),
         "frequency_hz": frequency_hz,
         "duration_s": 4.0 * cycle_s,
         "soft_start_s": cycle_s,
@@ -225,7 +226,7 @@ def _limits(
     value: Any = [low, high]
     if unit == "A" and _about_zero(low, high):
         range_key, value = "peak_current_a", min(high, -low)
-    stroke = [_rounded(0.9 * each, 3) for each in (info.sensor_min_um, info.sensor_max_um)]
+    stroke = [rounded_down(0.9 * each, 3) for each in (info.sensor_min_um, info.sensor_max_um)]
     return {range_key: value, slew_key: slew, "stroke_um": stroke}, {
         f"limits.{range_key}": f"set: rating of your actuator; range of the device {ends} {unit}",
         f"limits.{slew_key}": f"fastest change of the command, {unit}/s",
@@ -246,11 +247,3 @@ def round_hz(value: float) -> float:
 
 def _below(limit: float) -> float:
     return max((each for each in _RATES_HZ if each <= limit), default=limit)
-
-
-def _rounded(value: float, digits: int) -> float:
-    """Return a value rounded towards zero, because a limit must not grow."""
-    if value == 0.0:
-        return 0.0
-    step = 10.0 ** (math.floor(math.log10(abs(value))) - digits + 1)
-    return float(f"{math.trunc(value / step + math.copysign(1e-9, value)) * step:.12g}")
