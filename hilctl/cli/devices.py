@@ -2,6 +2,7 @@
 
 import math
 from collections.abc import Mapping
+from dataclasses import asdict
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -90,7 +91,7 @@ def show(
 ) -> None:
     """Show the options of a device, or the content of a profile."""
     described = describe(name)
-    print_result(described.to_mapping(), lambda: print_described(described), as_json=as_json)
+    print_result(asdict(described), lambda: print_described(described), as_json=as_json)
 
 
 @devices_.command()
@@ -98,7 +99,7 @@ def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson
     """Read an experiment's device and check its answers (nothing moves)."""
     require_linux()
     probed = read_device(experiment, settings or [])
-    print_result(probed.to_mapping(), lambda: print_probed(probed), as_json=as_json)
+    print_result(asdict(probed), lambda: print_probed(probed), as_json=as_json)
     if probed.faults:
         raise typer.Exit(3)
 

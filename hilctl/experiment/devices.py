@@ -10,7 +10,7 @@ The guardian imports this module, so it must not import numba.
 
 from collections.abc import Callable
 from contextlib import suppress
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
@@ -164,10 +164,6 @@ class DeviceDescription:
     place: str  # class of the device, or file of the profile
     options: tuple[DeviceOption, ...]  # keys of the device's section; empty for a profile
     profile: dict[str, Any]  # content of the profile; empty for a device
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
 
 
 def describe(name: str) -> DeviceDescription:

@@ -1,9 +1,8 @@
 """Probe: read an experiment's device and check its values for plausibility; nothing moves."""
 
 import math
-from dataclasses import asdict, dataclass
+from dataclasses import dataclass
 from pathlib import Path
-from typing import Any
 
 from hilctl.base.device import Device, DeviceInfo, DeviceReadings, ReadableDevice
 from hilctl.experiment.load import LoadedExperiment, load_experiment
@@ -28,10 +27,6 @@ class Probed:
     measured: float | None  # output as measured by the device; None if it is not
     command_unit: str
     faults: tuple[str, ...]  # implausible values, each with a possible cause
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the fields as plain values."""
-        return asdict(self)
 
 
 def probe(path: Path, settings: list[str]) -> Probed:

@@ -189,7 +189,7 @@ def test_a_profile_is_described_as_it_stands():
     found = describe("labjack_t7")
     assert found.profile["model"] == "T7"
     assert any("0 to 5 V only" in note for note in found.profile["notes"])
-    assert found.to_mapping()["options"] == ()
+    assert found.options == ()
 
 
 def test_own_profile_is_described_and_validated(tmp_path):
