@@ -48,6 +48,7 @@ from hilctl.studies.multi_run.collect import COMPLETED
 from hilctl.studies.multi_run.varied_parameter import (
     VariedParameter,
     dimensions,
+    plain_text,
     short_value,
     texts_of,
 )
@@ -220,7 +221,7 @@ def _steps(plan: CampaignPlan, varied: Sequence[VariedParameter]) -> Table:
     rows = [
         (
             str(each.step.number),
-            *(_shown(_values(each.step).get(parameter.key)) for parameter in varied),
+            *(plain_text(_values(each.step).get(parameter.key)) for parameter in varied),
             f"{each.seconds:.1f}" if each.kept is None else "",
             f"{each.pause_s:.0f}" if each.pause_s else "",
             f"{each.heat_a2**0.5:.2f}" if each.kept is None and each.heat_a2 else "",
@@ -233,12 +234,6 @@ def _steps(plan: CampaignPlan, varied: Sequence[VariedParameter]) -> Table:
     columns = [each for each in zip(headings, *rows, strict=True) if any(each[1:])]
     headings, *rows = zip(*columns, strict=True)
     return table(f"{plan.campaign.config.name}: steps", headings, rows, wrap=True)
-
-
-def _shown(value: Any) -> str:
-    if value is None:
-        return ""
-    return f"{value:g}" if isinstance(value, float) else str(cell(value))
 
 
 def _duration(seconds: float) -> str:

@@ -158,8 +158,7 @@ def prepared(folder: Path, host: StudyHost) -> Iterator[None]:
 
 def planned_in_real_time(campaign: CampaignSteps, folder: Path, now_s: float) -> CampaignPlan:
     """Return the plan of a campaign in real time; raise ConfigError if a step is not allowed."""
-    completed = completed_runs(folder) if folder.is_dir() else {}
-    last = last_started(folder) if folder.is_dir() else None
+    completed, last = completed_runs(folder), last_started(folder)
     plan = planned(campaign, folder, completed, 0.0)
     if not plan.left:
         return plan
@@ -303,7 +302,7 @@ def run_task(task: FastTask) -> tuple[bytes, CampaignRow, bool]:
 
 def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
     """Return the plan of a campaign without real time; raise InputError for a real device."""
-    plan = planned(campaign, folder, completed_runs(folder) if folder.is_dir() else {})
+    plan = planned(campaign, folder, completed_runs(folder))
     for each in plan.steps:
         info = each.loaded.device.info
         if not info.simulated:

@@ -24,7 +24,7 @@ from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.run_summary import read_ends, recordings_in
 from hilctl.run.run_folder import runs
-from hilctl.run.start import RunKey, completed_key
+from hilctl.run.start import RunKey, completed_key, unused
 from hilctl.studies.campaign.plan import CampaignPlan
 from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, cell, settings_of
 from hilctl.studies.multi_run.collect import (
@@ -164,11 +164,7 @@ def last_started(folder: Path) -> Path | None:
 
 def new_recording(folder: Path, name: str, number: int) -> Path:
     """Return an unused name: ``NAME-0001.mcap``, then ``NAME-0001-2.mcap``."""
-    path, attempt = folder / f"{name}-{number:04d}.mcap", 1
-    while os.path.lexists(path):
-        attempt += 1
-        path = folder / f"{name}-{number:04d}-{attempt}.mcap"
-    return path
+    return unused(folder / f"{name}-{number:04d}.mcap", "-")
 
 
 @dataclass(frozen=True, slots=True)

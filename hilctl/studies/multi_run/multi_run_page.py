@@ -24,7 +24,7 @@ from hilctl.studies.multi_run.trend import (
     headline,
     trends,
 )
-from hilctl.studies.multi_run.varied_parameter import texts_of
+from hilctl.studies.multi_run.varied_parameter import plain_text, texts_of
 
 MOST_ROWS = 1000  # most rows of the table on a page
 
@@ -79,7 +79,7 @@ def run_table(
     rows = [
         [
             f"{run.number}{' (reference)' if run.is_reference else ''}",
-            *(_shown(run, each.key) for each in series.dimensions),
+            *(plain_text(run.values.get(each.key)) for each in series.dimensions),
             *(quantity(each.value(run)) for each in figures),
             *(value(run) for value in last.values()),
         ]
@@ -104,11 +104,6 @@ def _last(series: RunSeries, *, short: bool) -> dict[str, Callable[[SeriesRun], 
 
 def _started(run: SeriesRun) -> str:
     return run.digest.started[:19].replace("T", " ") if run.digest else ""
-
-
-def _shown(run: SeriesRun, key: str) -> str:
-    value = run.values.get(key)
-    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
 
 
 def _trends(series: RunSeries) -> Iterator[str]:

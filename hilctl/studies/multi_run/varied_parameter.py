@@ -109,6 +109,11 @@ def short_value(value: Any) -> Hashable:
     return None if value is None else str(value)
 
 
+def plain_text(value: Hashable) -> str:
+    """Return a short value as text without its unit; empty for None."""
+    return "" if value is None else f"{value:g}" if isinstance(value, float) else str(value)
+
+
 def keys_of(runs: Sequence[Mapping[str, Any]]) -> list[str]:
     """Return the dotted keys in which experiments differ, in the order of the first one."""
     found: dict[str, None] = {}
