@@ -74,7 +74,6 @@ class CommandTable(TyperGroup):
 
     def format_commands(self, ctx: Any, formatter: Any) -> None:
         """Write the help line of each command, in the order of the table."""
-        del ctx
         with formatter.section("Commands"):
             lines = self.commands.items()
             formatter.write_dl([(name, each.get_short_help_str()) for name, each in lines])

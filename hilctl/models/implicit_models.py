@@ -64,14 +64,12 @@ class ImplicitModel(BoundedInputModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest; independent of the rate."""
-        del sample_rate_hz
         return Operator(
             implicit_forward, self.packed(), self.operators, output_offset=self.output_offset_um
         )
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
-        del sample_rate_hz
         parameters = (*self.packed(), self.command_span, TOLERANCE_UM)
         return Operator(
             implicit_inverse, parameters, self.operators, input_offset=-self.output_offset_um

@@ -476,7 +476,6 @@ class Translator:
         return f"({test} ? {a} : {b})", self._joined(body, one, another)
 
     def _kernel_call(self, node: ast.Call, callee: KernelSource, args: Sequence[str]) -> str:
-        del node
         return f"{callee.name}({', '.join(args)})"
 
 

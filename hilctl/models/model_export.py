@@ -234,7 +234,6 @@ class _MatlabFile(_CFile):
         return f"[{self._numbers(values)}]".replace("\n", " ...\n")
 
     def _array(self, name: str, shape: tuple[int, ...]) -> str:
-        del shape
         return name
 
     def _add(self, offset: str) -> None:

@@ -148,7 +148,6 @@ class SpiModel(PlayModel):
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest; independent of the rate."""
-        del sample_rate_hz
         direct, weights, thresholds = self.stop_parameters()
         stops = (direct, thresholds, weights)
         return Operator(stop_sum, stops, weights.size, input_offset=-self.output_offset_um)
@@ -211,7 +210,6 @@ class GeneralisedModel(BoundedInputModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest; independent of the rate."""
-        del sample_rate_hz
         plays = self.direct, np.array(self.thresholds), np.array(self.weights)
         parameters = (self.rising.array(), self.falling.array(), *plays)
         return Operator(
@@ -220,7 +218,6 @@ class GeneralisedModel(BoundedInputModel):
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest: inverse plays, inverse envelopes."""
-        del sample_rate_hz
         direct, weights, thresholds = inverse_plays(
             self.direct, np.array(self.weights), np.array(self.thresholds)
         )

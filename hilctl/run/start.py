@@ -131,7 +131,6 @@ def unpaced(
     heat_a2: float = 0.0,
 ) -> RunResult:
     """Run a simulated device without real time into a file."""
-    del on_part
     checked = checked_experiment(path, settings, heat_a2=heat_a2)
     return run_unpaced(checked, output, overwrite=overwrite)
 
