@@ -422,8 +422,7 @@ class SignalChain:
     def measured(self, source: Range) -> tuple[float, float]:
         """Return gain and offset of the command as measured by an input, in its unit.
 
-        Raises:
-            InputError: The input is neither in the unit of the output nor in that of the command.
+        Raise InputError if the input is in the unit of neither the output nor the command.
         """
         if source.unit == self._output_unit:
             return self._measured  # a calibration is relative to what is measured

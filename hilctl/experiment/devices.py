@@ -167,11 +167,7 @@ class DeviceDescription:
 
 
 def describe(name: str) -> DeviceDescription:
-    """Describe a device, shipped profile or file of a profile, not opened.
-
-    Raises:
-        InputError: The name is unknown, or the profile is invalid.
-    """
+    """Describe a device or a profile, not opened; raise InputError if it is unknown or invalid."""
     kinds, profiles = known_devices(), shipped_profiles()
     if name in profiles or is_path(name):
         path = Path(profiles.get(name, name))

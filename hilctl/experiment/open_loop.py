@@ -131,9 +131,8 @@ class MeasuredResponse(StrictModel):
     def open_loop(self, gains: Gains, exchange: Exchange) -> LoopResponse:
         """Return the open loop with a controller.
 
-        Raises:
-            InputError: The frequencies end before its lag reaches 180 degrees or before a
-                resonance, or the rate is another one.
+        Raise InputError if the frequencies end before its lag reaches 180 degrees or before a
+        resonance, or if the rate is another one.
         """
         if not math.isclose(exchange.rate_hz, self.sample_rate_hz, rel_tol=1e-6):
             was, now = self.sample_rate_hz, exchange.rate_hz

@@ -40,8 +40,7 @@ _FEWEST_CYCLES = 2
 def repeating(checked: CheckedExperiment) -> list[Segment]:
     """Return the periodic segments to learn, the first of equal ones.
 
-    Raises:
-        ConfigError: There is none with enough cycles, or no compensator.
+    Raise ConfigError if none has enough cycles, or without a compensator.
     """
     loaded = checked.loaded
 

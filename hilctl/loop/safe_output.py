@@ -143,8 +143,7 @@ class SafeOutput:
     def attempt(self) -> None:
         """Write once; update state, error and pause.
 
-        Raises:
-            LocalError: This process lacks memory or descriptors.
+        Raise LocalError if this process lacks memory or descriptors.
         """
         now_s = self._clock()
         if self._began_s is None:

@@ -48,11 +48,7 @@ _BINARY_FIELD = re.compile(r"\{value:([^{}]*)\}")
 
 @cache
 def binary_format(spec: str) -> RegisterFormat | None:
-    """Return the type of a field that stands for bytes; None for one of text.
-
-    Raises:
-        ValueError: The byte order does not fit the type.
-    """
+    """Return the type of a field of bytes, None for text; raise ValueError for a wrong order."""
     found = _BINARY.fullmatch(spec)
     return RegisterFormat(cast("RegisterType", found[1]), found[2] or "") if found else None
 
@@ -74,11 +70,7 @@ def as_text(data: bytes) -> str:
 
 
 def fill(template: str, **values: float) -> str:
-    """Return a template with its fields filled in.
-
-    Raises:
-        BadRequestError: The type of a field cannot hold the value.
-    """
+    """Fill in the fields of a template; raise BadRequestError if a type cannot hold its value."""
     return template.format(**{name: _Field(number) for name, number in values.items()})
 
 

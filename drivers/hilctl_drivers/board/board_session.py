@@ -54,8 +54,7 @@ class BoardValues:
     def encode(self, values: F64) -> bytes:
         """Return float64[n] as bytes; whole numbers are rounded half to even.
 
-        Raises:
-            BadRequestError: A value is not finite or out of the channel's range.
+        Raise BadRequestError if a value is not finite or out of the range of the channel.
         """
         low, high = self._channel.limits
         good = (values >= low) & (values <= high)

@@ -132,8 +132,7 @@ class StreamSession:
     def feed(self, values: F64) -> None:
         """Queue float64[n] values and fetch the available readings.
 
-        Raises:
-            DeviceError: The device refused them, ran out of values, or lost scans.
+        Raise DeviceError if the device refused them, ran out of values, or lost scans.
         """
         for first in range(0, values.size, stream.VALUES_MAX):
             part = values[first : first + stream.VALUES_MAX]

@@ -188,11 +188,7 @@ def tcp_pdu(adu: Bytes, transaction: int, unit: int) -> bytes:
 
 
 def rtu_adu(unit: int, pdu: bytes) -> bytes:
-    """Return ``pdu`` with CRC, for a unit from 1 to 255.
-
-    Raises:
-        BadRequestError: Unit 0 is broadcast, which has no answer.
-    """
+    """Return ``pdu`` with CRC; raise BadRequestError for unit 0, broadcast, which has no answer."""
     if not unit:
         raise BadRequestError("unit must be 1 to 255, got 0")
     frame = bytes((unit,)) + pdu

@@ -89,8 +89,7 @@ class RegisterFormat:
     def encode(self, value: float) -> bytes:
         """Return ``value`` as register bytes: bytes[size], integers rounded half to even.
 
-        Raises:
-            BadRequestError: ``value`` is not finite or the type cannot hold it; never clipped.
+        Raise BadRequestError if it is not finite or the type cannot hold it; never clipped.
         """
         raw = (value - self.offset) / self.scale
         if not isfinite(raw):

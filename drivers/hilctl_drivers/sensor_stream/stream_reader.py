@@ -42,8 +42,7 @@ class BlockParser:
     def feed(self, data: bytes) -> bool:
         """Take received bytes; return whether they complete a frame.
 
-        Raises:
-            CorruptError: A block does not begin as in the profile, or has no such input.
+        Raise CorruptError if a block does not begin as in the profile, or has no such input.
         """
         received, header, newest, start = self._received, self._header.size, 0, 0
         received += data
