@@ -10,20 +10,17 @@ edge of the band w moves with the centre. The midpoint rule integrates it in ste
 short enough for w to rise with y: so each displacement has one field, and each field one
 displacement.
 
-The command leads the field by the losses, in the mean over a sample::
+The command leads the field by the losses of :mod:`hilctl.kernels.field`. Their output m is a flux
+m(y) that rises with y.
 
-    v = w + z,  z + tau_b z' = h(e),  e = tau_0 w' + tau_1 m(y)',
-    h(e) = e (1 / (1 - g |e|) + b |e| + c e^2 + x / sqrt(|e| + e_0))
-
-with a flux m that rises with y. Before its pole, at g |e| = 0.9, the part with g continues along
-its tangent. Memory, float64[4]: y, w and z, then the previous input; NaN means that there is none
-yet. It is updated in place, so any cut into blocks gives the same bits.
+Memory, float64[4]: y, w and z, then the previous input; NaN means that there is none yet. It is
+updated in place, so any cut into blocks gives the same bits.
 
 Sources: B. D. Coleman and M. L. Hodgdon, "A constitutive relation for rate-independent hysteresis
 in ferromagnetically soft materials", Int. J. Eng. Sci. 24 (1986) 897; J. Oh and D. S. Bernstein,
 "Semilinear Duhem model for rate-independent and rate-dependent hysteresis", IEEE Trans. Autom.
 Control 50 (2005) 631 (the generalised model, of which the equations of Jiles and Atherton are a
-case); G. Bertotti, "Hysteresis in Magnetism", Academic Press 1998, chapter 12 (the losses).
+case).
 """
 
 import math
@@ -163,7 +160,7 @@ def duhem_columns(
 
 @kernel(inline=True)
 def _lost(e: float, losses: Losses) -> tuple[float, float]:
-    """Return h(e) and its slope."""
+    """Return h(e) of :mod:`hilctl.kernels.field` and its slope."""
     growth, bend, excess, self_growth, even = losses[3:8]
     size = abs(e)
     root = math.sqrt(size + even)
