@@ -19,7 +19,7 @@ from hilctl.base.segments import Segment
 from hilctl.base.strict import first_problem
 from hilctl.base.types import F64, I64
 from hilctl.machine.procfs import ProcessUsage
-from hilctl.recording.metadata_keys import USAGE_FACT
+from hilctl.recording.metadata_keys import END_FIGURES, USAGE_FACT
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
 from hilctl.signals.cycle_metrics import MeanCycle
@@ -27,16 +27,7 @@ from hilctl.signals.segment_metrics import SegmentMetrics
 
 _LIMITED = Flag.RANGE_LIMITED | Flag.SLEW_LIMITED | Flag.INVALID
 
-_WORST = (
-    "peak_hysteresis_percent",
-    "loop_area",
-    "peak_to_peak_um",
-    "peak_error_percent",
-    "rms_error_percent",
-    "peak_error_raw_percent",
-    "rms_error_raw_percent",
-)
-
+_WORST = (*END_FIGURES, "peak_error_raw_percent", "rms_error_raw_percent")
 
 Windows: TypeAlias = list[tuple[Segment, tuple[int, int, int]]]
 """Segments with their evaluated samples: first, after the last, whole cycles."""

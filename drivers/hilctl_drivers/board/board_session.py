@@ -13,6 +13,7 @@ from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.board_profile import FrameChannel, FrameProfile
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import (
+    ECHOED,
     BadRequestError,
     CorruptError,
     Link,
@@ -130,10 +131,7 @@ class BoardSession:
         reply = self.link.transact(self._frame(kind, body), self._framing.missing)
         payload = self._framing.decode(reply)
         if payload.startswith(board.HEAD.pack(kind, self._seq)):
-            raise CorruptError(
-                "the request came back before the reply: the adapter echoes, or receives what it "
-                "sends; set echo: true beside the address"
-            )
+            raise CorruptError(ECHOED)
         if len(payload) < board.REPLY_HEAD.size:
             raise MismatchError(f"reply of {len(payload)} bytes: {payload.hex(' ')}")
         found_kind, found_seq, status = board.REPLY_HEAD.unpack_from(payload)

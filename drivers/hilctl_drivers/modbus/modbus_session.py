@@ -30,6 +30,7 @@ from hilctl_drivers.modbus.register_map import (
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
 from hilctl_drivers.transport.links import (
+    ECHOED,
     CorruptError,
     IncompleteError,
     Link,
@@ -122,10 +123,7 @@ def _rtu_call(session: "ModbusSession", pdu: bytes) -> Call:
                 if crc == sent:
                     return read
         if adu.startswith(request):
-            raise CorruptError(
-                "the request came back before the reply: the adapter echoes, or receives what it "
-                "sends; set echo: true beside the address"
-            )
+            raise CorruptError(ECHOED)
         if lacking := missing(adu):
             raise IncompleteError(f"{lacking} more bytes belong to the reply")
         return session.read_data(request[1:-2], modbus.rtu_pdu(adu, unit))

@@ -27,6 +27,12 @@ Missing: TypeAlias = Callable[[bytearray], int]
 """Least number of bytes missing after the received ones; 0 if the reply is complete. It may raise
 if they cannot be the start of a reply."""
 
+ECHOED = (
+    "the request came back before the reply: the adapter echoes, or receives what it sends; "
+    "set echo: true beside the address"
+)
+"""What is wrong if a whole request is received where its reply is due."""
+
 
 class NoAnswerError(DeviceError):
     """No complete reply came in time."""
