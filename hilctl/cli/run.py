@@ -31,6 +31,7 @@ from hilctl.experiment.device_rules import interlock_context
 from hilctl.experiment.file import label_settings
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.live.server_process import served_beside
+from hilctl.loop.interlocks import for_longer_than
 from hilctl.loop.safe_output import describe
 from hilctl.machine.diagnosis import log_out
 from hilctl.machine.procfs import Machine
@@ -299,10 +300,8 @@ def print_forecast(checked: CheckedExperiment) -> None:
         rows["initial state"] = forecast.begins
     interlocks = config.interlocks
     if interlocks.tracking_error_um is not None:
-        most = f"at most {interlocks.tracking_error_um:g} µm"
-        rows["tracking error"] = (
-            f"{most}, longer than {interlocks.tracking_s or 0.0:g} s ends the run"
-        )
+        more = f"more{for_longer_than(interlocks.tracking_s)} ends the run"
+        rows["tracking error"] = f"at most {interlocks.tracking_error_um:g} µm; {more}"
     if aux := interlock_context(config, info).aux:
         rows["auxiliary"] = "; ".join(f"{each.channel.name}: {each}" for each in aux)
     if (trigger := _trigger(checked)) is not None:

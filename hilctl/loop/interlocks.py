@@ -256,7 +256,7 @@ class Interlocks:
         name = limit.channel.name
         text = f"{name} {value:.6g} {limit.channel.unit} at sample {sample} must be {limit}"
         if math.isnan(value):
-            since = _since(self.settings.sensor_invalid_s)
+            since = for_longer_than(self.settings.sensor_invalid_s)
             text = f"{name} at sample {sample} is no valid reading{since}"
         return Trip(sample, "aux", text)
 
@@ -294,13 +294,13 @@ class Interlocks:
             text = f"thermal budget of the coil, {budget}, was used up at sample {sample}"
             return Trip(sample, "thermal", text)
         error = f"tracking error {reference - displacement:.4g} µm at sample {sample}"
-        beyond = f"beyond {settings.tracking_error_um:g} µm{_since(settings.tracking_s)}"
+        beyond = f"beyond {settings.tracking_error_um:g} µm{for_longer_than(settings.tracking_s)}"
         return Trip(sample, "tracking_error", f"{error} is {beyond}")
 
     def _invalid(self, sample: int, displacement_um: float) -> Trip:
         reading = f"displacement {displacement_um:.4g} µm at sample {sample}"
         if math.isnan(displacement_um):
-            text = f"{reading} is no valid reading{_since(self.settings.sensor_invalid_s)}"
+            text = f"{reading} is no valid reading{for_longer_than(self.settings.sensor_invalid_s)}"
             return Trip(sample, "stroke", text)
         low, high = self.context.sensor_um
         if math.isfinite(displacement_um) and not low < displacement_um < high:
@@ -327,7 +327,7 @@ class Interlocks:
         away = f"more than {settings.measured_deviation:g} {unit} away"
         text = (
             f"measured {measured:.4g} {unit} at sample {sample}, with a command of {sent}, "
-            f"is {away}{_since(settings.deviation_s)}"
+            f"is {away}{for_longer_than(settings.deviation_s)}"
         )
         return Trip(sample, "deviation", text)
 
@@ -337,7 +337,8 @@ def warming(time_constant_s: float, sample_rate_hz: float) -> float:
     return -math.expm1(-1.0 / (time_constant_s * sample_rate_hz))
 
 
-def _since(time_s: float | None) -> str:
+def for_longer_than(time_s: float | None) -> str:
+    """Return the words for the time an interlock allows; nothing if it allows none."""
     return f" for longer than {time_s:g} s" if time_s else ""
 
 
