@@ -4,6 +4,7 @@ The table allows a command of ``hilctl_drivers``, which ``hilctl`` never imports
 """
 
 import ast
+import signal
 import sys
 from functools import cache
 from importlib import import_module
@@ -88,6 +89,9 @@ class CommandTable(TyperGroup):
         # typer would report an EOFError as Ctrl-D, but prompts raise typer.Abort.
         try:
             return super().invoke(ctx)
+        except KeyboardInterrupt:
+            signal.signal(signal.SIGINT, signal.SIG_IGN)  # exit waits for threads
+            raise
         except EOFError as error:
             raise RunError(system_error_text(error)) from error
         except Exception as error:

@@ -86,7 +86,6 @@ def run(
     # With stty tostop, output of a background job would stop the supervisor.
     signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     finish_dead_runs()
-    report, unread = None, False
     with compile_progress():
         with ExitStack() as stack:
             addresses = [stack.enter_context(served_beside())] if live else []
@@ -99,17 +98,26 @@ def run(
             )  # fmt: skip
             if result.stop_signal:  # a second Ctrl-C must not suppress the result
                 signal.signal(result.stop_signal, signal.SIG_IGN)
-        try:
-            report = report_of(result, every=as_json)
-        except HilctlError as error:  # not exit code 2, because the actuator has moved
-            print(f"hilctl: cannot report the recording: {error}", file=sys.stderr)
-            unread = True
+        report, failure = _report(result, every=as_json)
     values = run_mapping(result, report)
     print_result(values, lambda: print_run(result, report), as_json=as_json)
-    if result.code == "fault" or unread or not result.safe:
+    if result.code == "fault" or not result.safe:
         raise typer.Exit(3)
-    if result.stop_signal:
-        raise typer.Exit(128 + result.stop_signal)
+    if failure or result.stop_signal:
+        raise typer.Exit(failure or 128 + result.stop_signal)
+
+
+def _report(result: RunResult, *, every: bool) -> tuple[RunReport | None, int]:
+    """Return the report of a finished run, and the exit code if it fails; otherwise 0."""
+    try:
+        return report_of(result, every=every), 0
+    except HilctlError as error:  # not exit code 2, because the actuator has moved
+        print(f"hilctl: cannot report the recording: {error}", file=sys.stderr)
+        return None, 3
+    except KeyboardInterrupt:
+        signal.signal(signal.SIGINT, signal.SIG_IGN)  # the result is still printed
+        print("hilctl: report interrupted: see hilctl report", file=sys.stderr)
+        return None, 128 + signal.SIGINT
 
 
 @contextmanager

@@ -4,7 +4,6 @@ import logging
 from collections import defaultdict
 from collections.abc import Callable, Generator, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
-from contextlib import closing
 from dataclasses import replace
 from functools import cached_property
 from pathlib import Path
@@ -318,11 +317,14 @@ class RecordingStream:
 
 def _prefetched(pieces: Generator[Recording, None, None]) -> Iterator[Recording]:
     """Yield pieces while a thread reads the next one."""
-    with closing(pieces), ThreadPoolExecutor(1) as thread:
+    thread = ThreadPoolExecutor(1)
+    try:
         coming = thread.submit(next, pieces, None)
         while (piece := coming.result()) is not None:
             coming = thread.submit(next, pieces, None)
             yield piece
+    finally:
+        thread.shutdown(wait=False)  # Ctrl-C would interrupt a wait for the piece being read
 
 
 def _read(

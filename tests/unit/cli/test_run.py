@@ -51,6 +51,20 @@ def test_exit_code_of_an_incomplete_run(started, hilctl, code, stop_signal, exit
         signal.signal(signal.SIGTERM, before)
 
 
+def test_interrupted_report_keeps_the_result(started, hilctl, monkeypatch):
+    def interrupted(result, *, every):
+        raise KeyboardInterrupt
+
+    monkeypatch.setattr(module, "report_of", interrupted)
+    before = signal.getsignal(signal.SIGINT)
+    try:
+        code, out, _ = hilctl("run", DEMO, "--json")
+        assert signal.getsignal(signal.SIGINT) is signal.SIG_IGN
+    finally:
+        signal.signal(signal.SIGINT, before)
+    assert (code, json.loads(out)["code"]) == (130, "completed")
+
+
 def test_require_rt_is_the_last_setting(started, json_of):
     _, result = json_of("run", DEMO, "--require-rt", "--set", "block=25")
     assert started[0] == [(DEMO, ["block=25", "realtime.require=true"], None, False)]
