@@ -36,17 +36,9 @@ if TYPE_CHECKING:
     )
     from hilctl.api.connection import RunConnection, connect
     from hilctl.api.models import LoadedModel, compare, export_model, identify, load_model, refine
-    from hilctl.api.recordings import RecordedRun, export, list_runs, read, summarize
-    from hilctl.api.reports import (
-        figures,
-        frf,
-        replay,
-        report_page,
-        report_runs,
-        spectrum,
-        step,
-        tune,
-    )
+    from hilctl.api.recordings import RecordedRun, export, list_runs, read, replay, summarize
+    from hilctl.api.reports import figures, report_page, report_runs
+    from hilctl.api.responses import frf, spectrum, step, tune
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
     from hilctl.api.tables import RunTable, SampleTable
 
@@ -72,9 +64,8 @@ if not TYPE_CHECKING:
         },
         "connection": {"RunConnection", "connect"},
         "models": {"LoadedModel", "compare", "export_model", "identify", "load_model", "refine"},
-        "reports": {
-            "figures", "frf", "replay", "report_page", "report_runs", "spectrum", "step", "tune",
-        },
+        "reports": {"figures", "report_page", "report_runs"},
+        "responses": {"frf", "spectrum", "step", "tune"},
         "runs": {"WrittenExperiment", "check", "init", "load", "run"},
         "tables": {"RunTable", "SampleTable"},
     }  # fmt: skip

@@ -1,10 +1,10 @@
-"""Read, evaluate, list and export recordings."""
+"""Read, evaluate, replay, list and export recordings."""
 
 from collections.abc import Mapping
 from dataclasses import dataclass
 from functools import cached_property
 from pathlib import Path
-from typing import Any
+from typing import TYPE_CHECKING, Any
 
 from hilctl.analysis.catalogue import read_catalogue, select
 from hilctl.analysis.export import columns, units
@@ -19,6 +19,9 @@ from hilctl.recording.reader import read as read_file
 from hilctl.recording.recording import Recording
 from hilctl.recording.time_range import TimeRange
 from hilctl.run.control.client import finish_dead_runs
+
+if TYPE_CHECKING:
+    from hilctl.analysis.replay import ReplayResult
 
 
 @dataclass(frozen=True)
@@ -111,6 +114,24 @@ def summarize(
         DataError: The file is not a recording.
     """
     return judge(recording_of(run, from_s, to_s))
+
+
+def replay(run: RecordedRun | PathLike, model: PathLike | None = None) -> "ReplayResult":
+    """Recompute the commands of a run from its reference and compare them with the recorded ones.
+
+    Args:
+        run: Recording in memory, or a file, which is read in pieces.
+        model: Model file to replay with instead of the recorded model.
+
+    Raises:
+        InputError: The file does not exist.
+        DataError: The file is not a recording, or cannot be replayed.
+    """
+    from hilctl.analysis.replay import replay as recompute  # models and experiments
+    from hilctl.models.model_file import load_model
+
+    other = None if model is None else load_model(Path(model))
+    return recompute(recording_of(run), other)
 
 
 def export(

@@ -1,14 +1,16 @@
 """Commands that evaluate recordings: report, figures, replay."""
 
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TYPE_CHECKING, Annotated, Literal
 
 import typer
 from rich.console import Group
+from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
-from hilctl.analysis.replay import ReplayResult
+from hilctl.analysis.run_metrics import RunReport, quality_rows, run_rows, segment_table
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import printable, quantity
 from hilctl.cli.console import console, print_rich, progress_bar, table
@@ -23,10 +25,10 @@ from hilctl.cli.options import (
     recordings_argument,
 )
 from hilctl.cli.output import print_result
-from hilctl.cli.run import render_report
 from hilctl.run.control.client import finish_dead_runs
 
 if TYPE_CHECKING:
+    from hilctl.analysis.replay import ReplayResult
     from hilctl.studies.multi_run.collect import RunSeries
 
 RunsInput = Annotated[list[Path], recordings_argument("Recordings (MCAP), or a campaign folder.")]
@@ -36,6 +38,10 @@ OtherModel = Annotated[
 ]
 FOLDER = "figures"
 """Default folder for figures, within the folder of the runs or the working folder."""
+
+_MOST_MINUTES = 20
+_COUNTS = {"minute", "ticks"}
+_PAGE_ONLY = {"cycles", "start s", "freq. Hz", "floor %", "loop area"}  # a terminal has 80 columns
 
 
 def report(
@@ -128,6 +134,41 @@ def figures(
     print_result({"figures": captions}, lambda: print(lines), as_json=as_json)
 
 
+def render_report(report: RunReport) -> Group:
+    """Return the tables of a report; the segments have their own if there are several."""
+    rows, (headings, cells) = run_rows(report), segment_table(report)
+    title = printable(report.name) or "run"
+    parts = [_two_columns(title, rows)]
+    if quality := quality_rows(report):
+        parts = [_two_columns(title, quality), _two_columns("", rows)]
+    if len(cells) > 1:
+        shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
+        cells = [[row[i] for i in shown] for row in cells]
+        parts.append(table("segments, worst first", [headings[i] for i in shown], cells))
+    if len(report.lateness_by_minute) > 1:
+        parts.append(_minutes(report))
+    return Group(*parts)
+
+
+def _two_columns(title: str, rows: Sequence[tuple[str, str]]) -> Table:
+    made = table(title, ("", ""), rows, left={""}, wrap=True)
+    made.show_header, made.columns[0].style, made.columns[0].no_wrap = False, "bold", True
+    return made
+
+
+def _minutes(report: RunReport) -> Table:
+    minutes, title = report.lateness_by_minute, "lateness per minute, µs"
+    if len(minutes) > _MOST_MINUTES:  # --json contains all of them
+        title += f": worst {_MOST_MINUTES} of {len(minutes)}"
+        worst = sorted(minutes, key=lambda each: -each["max"])[:_MOST_MINUTES]
+        minutes = sorted(worst, key=lambda each: each["minute"])
+    rows = [
+        [f"{v:,}" if name in _COUNTS else f"{v:.4g}" for name, v in minute.items()]
+        for minute in minutes
+    ]
+    return table(title, [*minutes[0]], rows)
+
+
 def render_series(series: "RunSeries") -> Group:
     """Return the summary of several runs and a table of them."""
     from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table  # matplotlib
@@ -142,7 +183,7 @@ def render_series(series: "RunSeries") -> Group:
     return Group(Text(printable(" ".join(headline(series)))), *problems, runs, *files)
 
 
-def print_replay(result: ReplayResult, *, other: Path | None) -> None:
+def print_replay(result: "ReplayResult", *, other: Path | None) -> None:
     """Print the differences between recomputed and recorded commands."""
     show, unit = console().print, result.command_unit
     if result.left_out_samples:

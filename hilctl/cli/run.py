@@ -15,22 +15,20 @@ from typing import Annotated, Any
 
 import numpy as np
 import typer
-from rich.console import Group
-from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
-from hilctl.analysis.run_metrics import RunReport, quality_rows, run_rows, segment_table
+from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import adapted_text
-from hilctl.base.formatting import printable, unit_text
-from hilctl.cli.console import compile_progress, console, listing, progress_bar, table
+from hilctl.base.formatting import unit_text
+from hilctl.cli.console import compile_progress, console, listing, progress_bar
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import Verbosity, print_json, print_result
+from hilctl.cli.reports import render_report
 from hilctl.experiment.device_rules import interlock_context
 from hilctl.experiment.file import label_settings
 from hilctl.experiment.preflight import CheckedExperiment
-from hilctl.live.server_process import served_beside
 from hilctl.loop.interlocks import for_longer_than
 from hilctl.loop.safe_output import describe
 from hilctl.machine.diagnosis import log_out
@@ -47,9 +45,6 @@ _log = logging.getLogger(__name__)
 _REFRESH_S = 0.1
 _LARGEST_REPORTED = 5_000_000
 _VIEW_END_S = 2.0
-_MOST_MINUTES = 20
-_COUNTS = {"minute", "ticks"}
-_PAGE_ONLY = {"cycles", "start s", "freq. Hz", "floor %", "loop area"}  # a terminal has 80 columns
 
 
 def run(
@@ -88,7 +83,11 @@ def run(
     finish_dead_runs()
     with compile_progress():
         with ExitStack() as stack:
-            addresses = [stack.enter_context(served_beside())] if live else []
+            addresses = []
+            if live:
+                from hilctl.live.server_process import served_beside  # websockets
+
+                addresses.append(stack.enter_context(served_beside()))
             if watch:
                 stack.enter_context(_watched())
             shown = run_progress(quiet=as_json or watch, addresses=addresses)
@@ -241,41 +240,6 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
     terminal.print(f"recorded: {result.path}", soft_wrap=True)
     path = shlex.quote(str(result.path))
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
-
-
-def render_report(report: RunReport) -> Group:
-    """Return the tables of a report; the segments have their own if there are several."""
-    rows, (headings, cells) = run_rows(report), segment_table(report)
-    title = printable(report.name) or "run"
-    parts = [_two_columns(title, rows)]
-    if quality := quality_rows(report):
-        parts = [_two_columns(title, quality), _two_columns("", rows)]
-    if len(cells) > 1:
-        shown = [i for i, heading in enumerate(headings) if heading not in _PAGE_ONLY]
-        cells = [[row[i] for i in shown] for row in cells]
-        parts.append(table("segments, worst first", [headings[i] for i in shown], cells))
-    if len(report.lateness_by_minute) > 1:
-        parts.append(_minutes(report))
-    return Group(*parts)
-
-
-def _two_columns(title: str, rows: Sequence[tuple[str, str]]) -> Table:
-    made = table(title, ("", ""), rows, left={""}, wrap=True)
-    made.show_header, made.columns[0].style, made.columns[0].no_wrap = False, "bold", True
-    return made
-
-
-def _minutes(report: RunReport) -> Table:
-    minutes, title = report.lateness_by_minute, "lateness per minute, µs"
-    if len(minutes) > _MOST_MINUTES:  # --json contains all of them
-        title += f": worst {_MOST_MINUTES} of {len(minutes)}"
-        worst = sorted(minutes, key=lambda each: -each["max"])[:_MOST_MINUTES]
-        minutes = sorted(worst, key=lambda each: each["minute"])
-    rows = [
-        [f"{v:,}" if name in _COUNTS else f"{v:.4g}" for name, v in minute.items()]
-        for minute in minutes
-    ]
-    return table(title, [*minutes[0]], rows)
 
 
 def print_forecast(checked: CheckedExperiment) -> None:

@@ -5,7 +5,6 @@ Handbook of Frequency Stability Analysis, NIST SP 1065 (2008), for the overlappi
 """
 
 import numpy as np
-from scipy import signal
 
 from hilctl.base.types import C128, F64, I64
 from hilctl.signals.cycle_metrics import fold
@@ -54,6 +53,8 @@ def each_cycle(since: I64, period: float, values: F64, cycles: int, count: int =
 
 def amplitude_spectrum(values: F64, sample_rate_hz: float) -> tuple[F64, F64]:
     """Return frequencies, > 0, and the amplitude of a sine there, Hann window: float64[k] each."""
+    from scipy import signal  # it imports scipy.stats, which is slow
+
     hz, power = signal.periodogram(values, sample_rate_hz, "hann", scaling="spectrum")
     return hz[1:], np.sqrt(2.0 * power[1:])
 
@@ -64,6 +65,8 @@ def density(values: F64, sample_rate_hz: float, shortest: int = 0) -> tuple[F64,
     Averaged spectra of overlapping parts without their linear trend (Welch, Hann windows), of at
     least ``shortest`` samples each. The median is that of white noise with this mean power.
     """
+    from scipy import signal  # it imports scipy.stats, which is slow
+
     size = min(values.size, max(values.size // _AVERAGES, shortest, _SHORTEST))
     hz, power = signal.welch(values, sample_rate_hz, nperseg=size, detrend=signal.detrend)
     averages = 2 * values.size // size - 1

@@ -9,6 +9,7 @@ ROOT = UNIT.parents[1]
 PACKAGES = {Path(): ROOT / "hilctl", Path("drivers"): ROOT / "drivers" / "hilctl_drivers"}
 
 WITHOUT = {
+    "api/responses": "one call each; cli/test_responses.py makes all of them",
     "base/types": "names of types; waveforms/test_build.py reads arrays in chunks",
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
     "base/events": "one record of plain values; seen in run/shared/test_shared_page.py",

@@ -1,9 +1,10 @@
-"""The table of commands, and what help, status and stop import."""
+"""The table of commands, and what some of them import."""
 
 import os
 import re
 import subprocess
 import sys
+from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
@@ -12,6 +13,7 @@ from hilctl import __version__
 from hilctl.base.errors import InputError
 from hilctl.cli.commands import COMMANDS, load
 
+RECORDING = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 MAIN = "from hilctl.cli import main; main()"
 
 
@@ -92,10 +94,11 @@ def test_shell_completes_options_and_values(words, some, tmp_path, monkeypatch, 
     (["--help"], {}),
     (["status"], {}),
     (["stop", "--all"], {}),
+    (["report", str(RECORDING), "--json"], {}),
     ([], completing("hilctl run x.yaml --set limits.")),
     ([], completing("hilctl report ")),
 ])  # fmt: skip
-def test_help_status_stop_and_completion_import_nothing_heavy(words, environment):
+def test_commands_import_nothing_heavy_that_they_do_not_use(words, environment):
     code = """
 import sys
 from hilctl.cli import main
@@ -103,7 +106,8 @@ sys.argv[0] = "hilctl"
 try:
     main()
 finally:
-    print([each for each in ("numba", "scipy", "matplotlib") if each in sys.modules])
+    heavy = ("numba", "scipy", "matplotlib", "websockets")
+    print([each for each in heavy if each in sys.modules])
 """
     ended = in_a_process(code, *words, **environment)
     assert (ended.returncode, ended.stdout.splitlines()[-1]) == (0, "[]"), ended.stderr

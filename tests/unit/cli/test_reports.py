@@ -36,7 +36,7 @@ def test_different_replay_has_exit_code_1(recording, monkeypatch, hilctl):
     def different(path, model):
         return replace(recompute(path, model), identical=False, first_difference=0)
 
-    monkeypatch.setattr("hilctl.api.reports.recompute", different)
+    monkeypatch.setattr("hilctl.analysis.replay.replay", different)
     assert hilctl("replay", recording)[0] == 1
 
 

@@ -17,7 +17,8 @@ from hilctl.analysis.report import summarize
 from hilctl.base.segments import Segment
 from hilctl.cli import run as module
 from hilctl.cli.output import Verbosity
-from hilctl.cli.run import print_run, render_report, report_of, run_mapping, run_progress
+from hilctl.cli.reports import render_report
+from hilctl.cli.run import print_run, report_of, run_mapping, run_progress
 from hilctl.run.result import RunResult
 from hilctl.run.safety.manual_safe import SafeResult
 
