@@ -261,9 +261,10 @@ PORT_REMEDIES = {
 
 def reason(error: OSError, remedies: Mapping[int, str] = REMEDIES) -> str:
     """Return the text of an OS error, with a fix if one is known by its ``errno``."""
-    text = error.strerror or str(error)
-    remedy = remedies.get(error.errno or 0, "")
-    return f"{text} ({remedy})" if remedy else text
+    number = error.errno or 0
+    if remedy := remedies.get(number):
+        return f"{os.strerror(number)} ({remedy})"  # libraries add details to strerror
+    return error.strerror or str(error)
 
 
 def make_folder(path: Path) -> None:

@@ -24,6 +24,7 @@ from hilctl.base.samples import COLUMNS
 from hilctl.base.types import F64
 from hilctl.live.run_reader import RunList, RunReader
 from hilctl.live.scope import ROW
+from hilctl.live.server import listeners
 from hilctl.recording import schema
 from hilctl.recording.codec import encode_scope
 from hilctl.recording.encoder import Encoded, MessageMaker, RecordingLayout
@@ -226,6 +227,8 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
         raise InputError(
             "--foxglove: its library is not installed: pip install 'hilctl[foxglove]'"
         ) from None
+    for listener in listeners(port):  # the library's error names no remedy
+        listener.close()
     root = logging.getLogger()
     level, handlers = root.level, root.handlers[:]
     foxglove.set_log_level("ERROR")  # discards messages on invalid requests; changes all logs

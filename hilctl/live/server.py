@@ -241,7 +241,7 @@ class LiveServer:
     def __init__(
         self, chosen: Callable[[list[RunFolder]], RunFolder | None], port: int = 0
     ) -> None:
-        self._sockets = _listeners(port)
+        self._sockets = listeners(port)
         self.port = int(self._sockets[0].getsockname()[1])
         self._token = secrets.token_hex(16)
         self._pending: dict[ServerConnection, Callable[[], None]] = {}  # not authenticated yet
@@ -382,7 +382,7 @@ class LiveServer:
         return finite_json(state)
 
 
-def _listeners(port: int) -> list[socket.socket]:
+def listeners(port: int) -> list[socket.socket]:
     """Return sockets on a port of 127.0.0.1 and ::1 (with IPv6); raise InputError if taken."""
     with ExitStack() as stack:
         try:
