@@ -77,9 +77,11 @@ dt { font-weight: 600; break-after: avoid; } dd { margin: 0 0 .4rem 1rem; break-
   tr, main > .wide:not(:has(th:nth-child(6), .text ~ th:nth-child(5))) { break-inside: avoid; }
   tr:nth-child(-n+2), tr:nth-last-child(2) { break-after: avoid; }
   th, td { padding: .1rem .6rem .1rem 0; }
-  .side, .side section { margin: 0; break-inside: auto; } .figures svg { max-width: 66mm; }
+  .side, .side section { margin: 0; break-inside: auto; } .figures svg { max-width: 63mm; }
+  figure { margin-bottom: .6rem; }
   .wide { overflow: visible; } .wide:has(th:nth-child(10)) { font-size: 72%; }
-  details { display: none; } }
+  dt, dd { display: inline; margin: 0; } dt::after { content: ": "; }
+  dd::after { content: ""; display: block; margin-bottom: .2rem; } details { display: none; } }
 """
 
 _HEAD = """<!DOCTYPE html>
