@@ -6,6 +6,8 @@ from collections.abc import Mapping, Sequence
 from pathlib import Path
 from typing import TypeAlias
 
+from hilctl.base.files import already_there
+
 PathLike: TypeAlias = str | os.PathLike[str]
 Paths: TypeAlias = PathLike | Sequence[PathLike]
 Settings: TypeAlias = Mapping[str, object] | Sequence[str]
@@ -39,4 +41,6 @@ def path_or_none(path: PathLike | None) -> Path | None:
 def runs_folder(output: PathLike, folder: PathLike | None = None) -> Path:
     """Return the folder for the runs that lead to a file; default: ``OUTPUT-runs``."""
     file = Path(output)
+    if not file.name:
+        raise already_there(file, "")
     return path_or_none(folder) or file.with_name(f"{file.stem}-runs")

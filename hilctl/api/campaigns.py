@@ -7,7 +7,7 @@ from pathlib import Path
 
 from hilctl.api._types import PathLike, Settings, path_or_none, runs_folder, texts_of
 from hilctl.base.errors import InputError
-from hilctl.base.files import check_no_input, check_writable, write_text
+from hilctl.base.files import check_no_input, check_writable, is_folder, write_text
 from hilctl.base.table import Column
 from hilctl.experiment.correction import write_correction
 from hilctl.experiment.load import inputs_of
@@ -268,9 +268,10 @@ def learn(
     file, chosen = Path(output), runs_folder(output, folder)
     inputs = inputs_of(Path(experiment), texts_of(settings))
     check_writable(file, overwrite=overwrite, inputs=inputs)
-    for path in chosen.glob("run-*.*"):
+    runs = [*chosen.glob("run-*.*")] if is_folder(chosen) else []
+    for path in runs:
         check_no_input(path, inputs)
-    if not overwrite and any(chosen.glob("run-*.mcap")):
+    if not overwrite and any(path.suffix == ".mcap" for path in runs):
         raise InputError(f"{chosen}: contains runs: choose another --folder, or use --overwrite")
     session = IlcSession(Path(experiment), texts_of(settings), chosen, unpaced if fast else paced)
     learned = session.learn(cycles, on_rows)

@@ -13,7 +13,7 @@ from hilctl.analysis.run_page import page, run_sheets
 from hilctl.api._types import PathLike, Paths, paths_of
 from hilctl.api.recordings import stream_of
 from hilctl.base.errors import InputError
-from hilctl.base.files import check_writable, write_text
+from hilctl.base.files import check_writable, is_folder, write_text
 from hilctl.models.model_file import load_model
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.studies.multi_run.collect import RunSeries, collect
@@ -138,7 +138,7 @@ def figures(
 def _sheets(
     runs: list[Path], model: PathLike | None, on_progress: Callable[[float, str], None]
 ) -> list[FigureSpec]:
-    if len(runs) > 1 or runs[0].is_dir() or model is not None:
+    if len(runs) > 1 or is_folder(runs[0]) or model is not None:
         return applying_sheets(_series(runs, model, on_progress))
     summary, shown = overview(stream_of(runs[0]))
     if not (found := run_sheets(shown, summary)):

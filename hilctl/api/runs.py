@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hilctl.api._types import PathLike, Settings, path_or_none, texts_of
 from hilctl.base.device import DeviceInfo
-from hilctl.base.files import already_there, write_text
+from hilctl.base.files import already_there, exists, write_text
 from hilctl.base.types import CommandUnit
 from hilctl.experiment.examples import copy_schema
 from hilctl.experiment.load import LoadedExperiment, load_experiment
@@ -73,7 +73,7 @@ def default_path(device: str) -> Path:
 
 def refuse_existing(path: Path) -> None:
     """Raise :class:`hilctl.base.errors.InputError` if a file exists."""
-    if path.exists():
+    if exists(path):
         raise already_there(path, "choose another --output")
 
 

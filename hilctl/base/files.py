@@ -52,6 +52,21 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
         raise InputError(f"{path}: is not UTF-8 text") from None
 
 
+def exists(path: Path) -> bool:
+    """Return whether a path exists; unlike Path.exists, false instead of an OSError."""
+    return os.path.exists(path)  # noqa: PTH110
+
+
+def is_file(path: Path) -> bool:
+    """Return whether a path is a file; unlike Path.is_file, false instead of an OSError."""
+    return os.path.isfile(path)  # noqa: PTH113
+
+
+def is_folder(path: Path) -> bool:
+    """Return whether a path is a folder; unlike Path.is_dir, false instead of an OSError."""
+    return os.path.isdir(path)  # noqa: PTH112
+
+
 def read_bytes(path: Path, max_bytes: int) -> bytes:
     """Return the content of a file; raise InputError if it cannot be read, or is too large."""
     try:

@@ -12,7 +12,7 @@ import typer
 from hilctl import api
 from hilctl.api.runs import default_path, is_set, refuse_existing
 from hilctl.base.errors import ConfigError, InputError
-from hilctl.base.files import read_text, write_text
+from hilctl.base.files import is_file, read_text, write_text
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, dump
 from hilctl.cli.console import listing, print_rich
@@ -276,6 +276,6 @@ def schema(
     if output is None:
         print(schema_text(), end="")
         return
-    if output.is_file() and read_text(output).strip()[:1] not in {"", "{"}:
+    if is_file(output) and read_text(output).strip()[:1] not in {"", "{"}:
         raise InputError(f"{output} is not JSON and is not replaced: choose another --output")
     write_text(output, schema_text(), overwrite=True)

@@ -12,6 +12,7 @@ from rich.text import Text
 from hilctl import api
 from hilctl.analysis.run_metrics import RunReport, quality_rows, run_rows, segment_table
 from hilctl.base.errors import InputError
+from hilctl.base.files import is_folder
 from hilctl.base.formatting import printable, quantity
 from hilctl.cli.console import console, print_rich, progress_bar, table
 from hilctl.cli.options import (
@@ -62,7 +63,7 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Evaluate recordings or a campaign: hysteresis, error, noise, lateness."""
-    if len(runs) > 1 or runs[0].is_dir():
+    if len(runs) > 1 or is_folder(runs[0]):
         if from_s is not None or to_s is not None or before is not None:
             raise InputError("--from, --to and --before apply to the report of one recording only")
         with progress_bar("read", quiet=as_json) as on_progress:
@@ -122,7 +123,7 @@ def figures(
     as_json: AsJson = False,
 ) -> None:
     """Plot the results of runs by what was varied: loops, trends, errors."""
-    folder = output or (runs[0] / FOLDER if runs[0].is_dir() else Path(FOLDER))
+    folder = output or (runs[0] / FOLDER if is_folder(runs[0]) else Path(FOLDER))
     written: dict[Path, str] = {}
     with progress_bar("figures", quiet=as_json) as on_progress:
         api.figures(

@@ -7,7 +7,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError
-from hilctl.base.files import already_there, check_no_input, make_folder, write_text
+from hilctl.base.files import already_there, check_no_input, exists, make_folder, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document
 from hilctl.comparison.simulated_trials import (
@@ -249,7 +249,7 @@ def check_free(
     paths = [folder / f"{name}.yaml" for name in names]
     for path in paths:
         check_no_input(path, inputs)
-    taken = [path for path in paths if path.exists()]
+    taken = [path for path in paths if exists(path)]
     if taken and not overwrite:
         raise already_there(taken[0], "give another --save, or --overwrite")
 

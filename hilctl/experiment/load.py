@@ -9,7 +9,7 @@ from typing import TypeVar
 
 from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
-from hilctl.base.files import TextFiles
+from hilctl.base.files import TextFiles, is_file
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document, dump, load_document, loc_of
 from hilctl.experiment.correction import Correction, load_correction
@@ -104,7 +104,7 @@ def named_from(folder: Path, setting: str) -> str:
     name = text.strip().strip("'\"")
     if key.strip() not in FILE_KEYS or not name or Path(name).is_absolute():
         return setting
-    if not Path(name).is_file():
+    if not is_file(Path(name)):
         return setting
     return f"{key}={json.dumps(os.path.relpath(name, folder), ensure_ascii=False)}"
 

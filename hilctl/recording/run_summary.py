@@ -12,7 +12,7 @@ from mcap.records import Metadata, MetadataIndex, SummaryOffset
 from mcap.writer import MCAP0_MAGIC as MAGIC
 
 from hilctl.base.errors import DataError
-from hilctl.base.files import open_binary, reason
+from hilctl.base.files import is_folder, open_binary, reason
 from hilctl.recording.mcap_records import footer_of, records_from
 from hilctl.recording.metadata_keys import CHECKSUM_FACT, unsealed
 from hilctl.recording.recording_files import is_being_recorded
@@ -40,7 +40,8 @@ class RunSummary:
 
 def recordings_in(folder: Path) -> list[Path]:
     """Return the regular files of a folder with the suffix of recordings, sorted by name."""
-    return sorted(path for path in folder.glob("*.mcap") if path.is_file())
+    paths = folder.glob("*.mcap") if is_folder(folder) else ()
+    return sorted(path for path in paths if path.is_file())
 
 
 def read_ends(path: Path) -> RunSummary:

@@ -15,7 +15,7 @@ from hilctl.base.calibration import (
     SensorCalibration,
 )
 from hilctl.base.errors import DataError, InputError, RunError
-from hilctl.base.files import check_writable, write_text
+from hilctl.base.files import check_writable, exists, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.strict import ValidationError
 from hilctl.base.table import Column, open_table
@@ -216,7 +216,7 @@ def existing_calibration(path: Path, part: str, *, overwrite: bool) -> Calibrati
 
     Raise InputError if it has this part already, is something else, or cannot be written.
     """
-    if not path.exists():
+    if not exists(path):
         check_writable(path, overwrite=overwrite)
         return None
     before = load_document(path).validate(CalibrationFile)

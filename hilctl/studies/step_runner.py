@@ -14,6 +14,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import InputError
+from hilctl.base.files import exists
 from hilctl.run.result import RunResult
 from hilctl.run.start import StepStoppedError, paced
 
@@ -88,7 +89,7 @@ def raise_if_stopped(name: str, result: RunResult) -> None:
 
 def free_mb(folder: Path) -> float:
     """Return the free disk space for a folder that may not exist yet, in MB."""
-    around = next(path for path in (folder, *folder.absolute().parents) if path.exists())
+    around = next(path for path in (folder, *folder.absolute().parents) if exists(path))
     return shutil.disk_usage(around).free / 1e6
 
 

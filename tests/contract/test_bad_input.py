@@ -238,6 +238,21 @@ def test_folder_for_recordings(refused):
     refused("cannot create regular/runs", "run", "x.yaml", "--set", setting)
 
 
+@pytest.mark.usefixtures("outputs")
+@pytest.mark.parametrize("words", [
+    "report {} run.mcap", "figures {} --output f", "schema --output {}",
+    "run x.yaml --set compensator.model={}",
+    "sweep x.yaml --vary waveform.amplitude=0.5,1 --fast --folder {}",
+])  # fmt: skip
+def test_path_that_the_system_refuses(refused, words):
+    refused("File name too long", *words.format("x" * 300).split())
+
+
+@pytest.mark.usefixtures("outputs")
+def test_output_without_a_name(refused):
+    refused(".: is a folder", "learn", "x.yaml", "--fast", "--output", "")
+
+
 @pytest.mark.parametrize("words", ["report {}", "replay {}", "export {} out.csv"])
 def test_recording_to_read(refused, place, words):
     (place / "folder.mcap").mkdir()

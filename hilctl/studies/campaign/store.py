@@ -16,7 +16,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from hilctl.analysis.export import write_parquet
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.files import write_file, write_text
+from hilctl.base.files import exists, write_file, write_text
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
 from hilctl.experiment.file import RecordingConfig
 from hilctl.experiment.load import document_with
@@ -60,7 +60,7 @@ def locked_folder(
     folder: Path, sleep_s: Callable[[float], None], wait_s: float = 5.0
 ) -> Iterator[None]:
     """Create and lock a campaign's folder; raise InputError if another campaign uses it."""
-    made = [each for each in (folder, *folder.parents) if not each.exists()]
+    made = [each for each in (folder, *folder.parents) if not exists(each)]
     try:
         folder.mkdir(parents=True, exist_ok=True)
         # Windows has no locks and cannot open a folder.

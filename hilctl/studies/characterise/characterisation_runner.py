@@ -8,7 +8,7 @@ from functools import cached_property
 from pathlib import Path
 
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
-from hilctl.base.files import check_writable, make_folder, write_text
+from hilctl.base.files import check_writable, exists, make_folder, write_text
 from hilctl.base.types import F64
 from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_before
@@ -241,7 +241,7 @@ class CharacterisationRunner:
         Raise InputError if it was recorded with other settings, not as a consequence of an earlier
         step that was run again.
         """
-        if not path.exists():
+        if not exists(path):
             return None
         try:
             recording = read(path)

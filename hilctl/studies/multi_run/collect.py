@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.files import read_text
+from hilctl.base.files import is_file, is_folder, read_text
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.reader import read
 from hilctl.recording.run_summary import recordings_in
@@ -198,7 +198,7 @@ def collect(
         InputError: A folder contains no recordings, or is not the only path.
         DataError: A named recording, or the table, can't be read.
     """
-    folders = [path for path in paths if path.is_dir()]
+    folders = [path for path in paths if is_folder(path)]
     if folders and len(paths) > 1:
         raise InputError(f"{folders[0]}: is a folder. Specify one folder, or recordings only")
     if not folders:
@@ -219,7 +219,7 @@ def series_of(name: str, runs: Sequence[SeriesRun], missing: Sequence[str] = ())
 
 
 def _digest(path: Path, model: HysteresisModel | None) -> RunDigest:
-    if path.is_file() and path.stat().st_size > MOST_BYTES:
+    if is_file(path) and path.stat().st_size > MOST_BYTES:
         raise DataError(
             f"{path}: is larger than {MOST_BYTES >> 20} MB, the limit of a page of many runs. "
             f"Use 'hilctl report {path}'"

@@ -13,7 +13,7 @@ from matplotlib.figure import Figure
 from hilctl.analysis.figure_layout import ColumnWidth, FigureSpec, Panel, drawn, write_figure
 from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, plain_numbers
 from hilctl.base.errors import InputError
-from hilctl.base.files import already_there, make_folder
+from hilctl.base.files import already_there, exists, make_folder
 from hilctl.base.formatting import unit_text
 from hilctl.studies.multi_run.collect import OnRead, RunSeries, SeriesRun
 from hilctl.studies.multi_run.run_plots import (
@@ -271,7 +271,7 @@ def write_sheets(
 ) -> dict[Path, str]:
     """Write figures; return files with captions. Raise InputError if one exists or fails."""
     names = [folder / f"{sheet.name}.{each}" for sheet in sheets for each in formats]
-    taken = [path for path in names if path.exists()]
+    taken = [path for path in names if exists(path)]
     if taken and not overwrite:
         raise already_there(taken[0], "give another --output, or --overwrite")
     make_folder(folder)
