@@ -3,6 +3,7 @@
 Text has the same size in all widths, so that one figure serves in print and on a page.
 """
 
+import io
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from functools import partial
@@ -172,4 +173,6 @@ def write_figure(
 
 @mpl.rc_context(STYLE)
 def _write(figure: Figure, chosen: str, stream: BinaryIO) -> None:
-    figure.savefig(stream, format=chosen, dpi=_DPI, metadata=_UNDATED[chosen])
+    drawing = io.BytesIO()  # on a full disk, the PDF writer would end in an error of its own
+    figure.savefig(drawing, format=chosen, dpi=_DPI, metadata=_UNDATED[chosen])
+    stream.write(drawing.getbuffer())
