@@ -16,7 +16,7 @@ from mcap.writer import MCAP0_MAGIC
 
 from hilctl.analysis.export import write_parquet
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.files import exists, write_file, write_text
+from hilctl.base.files import exists, reason, write_file, write_text
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
 from hilctl.experiment.file import RecordingConfig
 from hilctl.experiment.load import document_with
@@ -113,7 +113,7 @@ def await_runs(folder: Path, sleep_s: Callable[[float], None]) -> None:
 
 
 def repair_recordings(folder: Path) -> list[str]:
-    """Repair truncated recordings; return one line per repaired file.
+    """Repair truncated recordings; return one line per repaired file, or raise InputError.
 
     A file of a run that never started has no samples: an empty file is deleted, and one with an
     incomplete header is kept as ``NAME.torn``.
@@ -124,7 +124,10 @@ def repair_recordings(folder: Path) -> list[str]:
             if read_ends(path).state in {"unfinished", "damaged"}:
                 done.append(f"{path}: {recover_recording(path).reason}")
         except DataError:
-            done += _put_aside(path)
+            try:
+                done += _put_aside(path)
+            except OSError as error:
+                raise InputError(f"{path}: can't be repaired: {reason(error)}") from None
     return done
 
 
