@@ -220,7 +220,7 @@ def test_a_ramp_that_another_process_began_is_gone_on_with(guarded):
 
 
 def test_it_keeps_trying_until_the_user_ends_it(guarded):
-    tries = []
+    tries, confirmed = [], guarded.device.make_safe
 
     def make_safe(value):
         tries.append(value)
@@ -234,6 +234,10 @@ def test_it_keeps_trying_until_the_user_ends_it(guarded):
     assert len(tries) >= 3
     assert "no answer" in guarded.page.safe_result().error
     assert not guarded.page.safe_result().final
+    guarded.device.make_safe = confirmed  # ends the thread, which would end with its process
+    for thread in threading.enumerate():
+        if thread.name == "safe action":
+            thread.join()
 
 
 @pytest.mark.parametrize("error", [MemoryError(), ZeroDivisionError("a bug")])

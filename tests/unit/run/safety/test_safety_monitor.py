@@ -112,7 +112,10 @@ def page(ring):
 
 @pytest.fixture
 def run(ring, monkeypatch):
-    return Run(ring, monkeypatch)
+    made = Run(ring, monkeypatch)
+    yield made
+    if made.safety._action is not None:  # with its thread, later runs would start a process each
+        assert made.safety._action.end(wait_s=5.0)
 
 
 def test_a_guardian_that_is_awake_does_it(run, page):
