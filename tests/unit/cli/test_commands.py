@@ -81,6 +81,7 @@ def test_shell_completes_options_and_values(words, some, tmp_path, monkeypatch, 
     day = tmp_path / "recordings" / "day"
     day.mkdir(parents=True)
     (day / "a.mcap").touch()
+    load(words.split(" ")[0])  # it must not import the fake run for all later tests
     card = SimpleNamespace(name="rig-1", experiment="rig.yaml")
     monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(card=card)])
     for name, value in completing(f"hilctl {words}").items():
