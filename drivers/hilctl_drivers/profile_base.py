@@ -173,8 +173,10 @@ class Watchdog(StrictModel):
     kick: Literal["any", "write", "strict"] = Field(
         description="requests that feed it: any, write, or only the feed steps (strict)"
     )
-    on_trip: Literal["safe", "zero", "hold", "reset", "unknown"] = Field(
-        description="outputs after a trip: safe value, zero, held, or reset of the device"
+    on_trip: Literal["safe", "stored", "zero", "hold", "reset", "unknown"] = Field(
+        description="outputs after a trip: safe (value set by steps), stored (value stored in the"
+        " device beforehand, which safe_command must equal), zero, hold, reset (of the device)"
+        " or unknown"
     )
     refuses_while_tripped: bool = Field(description="whether a trip blocks commands until cleared")
 
@@ -214,6 +216,20 @@ class SteppedWatchdog(Watchdog, Generic[Step]):
         default={}, description="steps that set the safe value, per output"
     )
 
+    @model_validator(mode="after")
+    def _sends_its_settings(self) -> Self:
+        if self.on_trip == "safe" and not _has_setting((self.safe, self.arm), "safe"):
+            raise ValueError(
+                "on_trip must be stored, zero, hold, reset or unknown if no step in safe or arm has"
+                " the safe value, got safe"
+            )
+        if self.min_s != self.max_s and not _has_setting(self, "timeout"):
+            raise ValueError(
+                "min_s and max_s must be equal (a fixed timeout) if no step has the timeout, got"
+                f" {self.min_s:g} and {self.max_s:g}"
+            )
+        return self
+
     def arming(self, output: str) -> tuple[Step, ...]:
         """Return all steps that arm it, with the safe value of an output first.
 
@@ -242,6 +258,14 @@ def parts_of(part: object, key: str = "") -> Iterator[tuple[str, object]]:
         parts = dict(enumerate(part))
     for name, each in parts.items():
         yield from parts_of(each, f"{key}.{name}" if key else f"{name}")
+
+
+def _has_setting(steps: object, name: str) -> bool:
+    """Return whether a step has ``timeout`` or ``safe``, as its value or as a field of its text."""
+    return any(
+        isinstance(each, str) and (f"{{{name}" in each or (key.endswith("value") and each == name))
+        for key, each in parts_of(steps)
+    )
 
 
 class BaseProfile(StrictModel):

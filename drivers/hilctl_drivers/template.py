@@ -167,3 +167,5 @@ def _watchdog(made: StartingSection, has: Watchdog | str) -> None:
     silence_s = min(max(_SILENCE_S, has.min_s), has.max_s)
     made.values["watchdog"] = {"timeout_s": silence_s, "safe_command": 0.0}
     made.remarks["watchdog"] = "the device's own: what it does when this machine falls silent"
+    if has.on_trip == "stored":
+        made.remarks["watchdog.safe_command"] = "set: the value that is stored in the device"

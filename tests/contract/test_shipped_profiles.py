@@ -102,8 +102,8 @@ SPECIAL = [
 ]
 WATCHDOGS = {
     "labjack_t4": (1.0, "any", "safe", False), "labjack_t7": (1.0, "any", "safe", False),
-    "labjack_t8": (1.0, "any", "safe", False), "adam_4024_ascii": (0.1, "any", "safe", False),
-    "icp_m7024": (0.1, "write", "safe", True), "icp_m7024_dcon": (0.1, "strict", "safe", True),
+    "labjack_t8": (1.0, "any", "safe", False), "adam_4024_ascii": (0.1, "any", "stored", False),
+    "icp_m7024": (0.1, "write", "stored", True), "icp_m7024_dcon": (0.1, "strict", "safe", True),
     "wago_750": (0.1, "write", "zero", True), "beckhoff_bk9000": (0.001, "write", "zero", True),
     "cobs_board": (0.001, "any", "safe", True), "cobs_board_fifo": (0.001, "any", "safe", True),
 }  # fmt: skip

@@ -228,8 +228,8 @@ class EmulatedModbus(EmulatedDevice):
         for name, words in self._outputs.items():
             channel = self.profile.outputs[name]
             value: float | None = min(max(0.0, channel.min), channel.max)
-            if watchdog.on_trip == "safe" and watchdog.safe:
-                value = self._safe_value(name, watchdog.safe.get(name, ()))
+            if watchdog.on_trip == "safe":
+                value = self._safe_value(name, watchdog.safe.get(name) or watchdog.arm)
             if value is None or watchdog.on_trip in {"hold", "unknown"}:
                 continue
             if not self._holds_trip:

@@ -245,5 +245,5 @@ class EmulatedText(SerialDevice):
         at_zero = watchdog.on_trip in {"zero", "reset"}
         for name, value in self._values.items():
             held = 0.0 if at_zero else value
-            target = self._safe[name] if watchdog.on_trip == "safe" else held
+            target = self._safe[name] if watchdog.on_trip in {"safe", "stored"} else held
             self._put_out(name, target, "watchdog", due_ns)

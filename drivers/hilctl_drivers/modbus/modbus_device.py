@@ -121,7 +121,7 @@ class ModbusDevice(SteppedDac):
                 return scaled.format.decode(self._writer.read_bytes(scaled))
         if has.on_trip in {"zero", "reset"}:
             return 0.0
-        if wanted == "none" or has.on_trip != "safe":
+        if wanted == "none" or has.on_trip not in {"safe", "stored"}:
             return None
         return float(self._chain.output(wanted.safe_command))
 

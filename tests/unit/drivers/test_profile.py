@@ -137,6 +137,13 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
      "selftest: expect must fit into uint16, got 65536"),
     ("modbus", {"watchdog": WATCHDOG | {"min_s": 30.0}}, "watchdog: min_s must be <= max_s"),
     ("modbus", {"watchdog": WATCHDOG | {"kick": "strict"}}, "feed steps and kick: strict go"),
+    ("modbus", {"watchdog": WATCHDOG | {"on_trip": "safe"}}, "watchdog: on_trip must be stored"),
+    ("modbus", {"watchdog": WATCHDOG | {"on_trip": "safe", "safe": {"AO": []}}}, "on_trip must be"),
+    ("modbus", {"watchdog": WATCHDOG | {"arm": [{"kind": "write", "address": 9, "type": "uint16",
+                                                 "value": 20}]}},
+     "watchdog: min_s and max_s must be equal"),
+    ("ascii", {"watchdog": WATCHDOG | {"arm": [{"kind": "send", "text": "W1"}]}},
+     "watchdog: min_s and max_s must be equal"),
     ("modbus", {"watchdog": WATCHDOG | {"safe": {"XO": []}}},
      "watchdog.safe.XO must be one of the outputs"),
     ("modbus", {"watchdog": WATCHDOG | {"tripped": {"address": 1, "type": "uint16",
@@ -172,9 +179,9 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("ascii", {"watchdog": {**{k: v for k, v in WATCHDOG.items() if k != "arm"},
                             "kick": "strict", "arm": [{"kind": "send", "text": "W{timeout}"}]}},
      "feed steps and kick: strict go together"),
-    ("ascii", {"watchdog": WATCHDOG | {"arm": [{"kind": "send", "text": "W {safe:.0f}"}]}},
+    ("ascii", {"watchdog": WATCHDOG | {"arm": [{"kind": "send", "text": "W{timeout} {safe:.0f}"}]}},
      "watchdog.arm.0.text must have the digits of 0.005 A"),
-    ("ascii", {"watchdog": WATCHDOG | {"arm": [{"kind": "send", "text": "W {safe:.3f}"}],
+    ("ascii", {"watchdog": WATCHDOG | {"arm": [{"kind": "send", "text": "W{timeout} {safe:.3f}"}],
                                        "safe": {"OUT": [{"kind": "send", "text": "{safe:.1f}"}]}}},
      "watchdog.safe.OUT.0.text must have the digits of 0.005 A"),
     ("board", {"streaming": None}, "streaming and exchange: stream go together"),
@@ -197,6 +204,18 @@ class TestRules:
         assert len(found) == 1, found
         assert re.match(r"acme\.yaml:\d+: ", found[0])
         assert message in found[0]
+
+    @pytest.mark.parametrize("changes", [
+        {"on_trip": "stored"},
+        {"min_s": 2.0, "max_s": 2.0, "arm": [{"kind": "send", "text": "W1"}]},
+        {"on_trip": "safe", "arm": [{"kind": "send", "text": "W{timeout:d} {safe:.4f}"}]},
+    ])  # fmt: skip
+    def test_settings_of_a_watchdog(self, changes):
+        """A fixed timeout, and a value stored in the device, need no step."""
+        arm = [{"kind": "send", "text": "W{timeout:d}"}]
+        parse_profile(
+            changed("ascii", {"watchdog": WATCHDOG | {"arm": arm} | changes}), "acme.yaml"
+        )
 
     @pytest.mark.parametrize("base", ["modbus", "ascii"])
     @pytest.mark.parametrize("group", ["outputs", "inputs"])

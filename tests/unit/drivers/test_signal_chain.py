@@ -41,7 +41,7 @@ def asked(has, offset_a=0.0, **wanted):
 
 
 def watchdog(**changes):
-    arm = ({"kind": "send", "text": "W{timeout}"},)
+    arm = ({"kind": "send", "text": "W{timeout} {safe}"},)
     data = {
         "unit_s": 0.1, "min_s": 0.1, "max_s": 10.0, "kick": "any", "on_trip": "safe",
         "refuses_while_tripped": False, "arm": arm, **changes,

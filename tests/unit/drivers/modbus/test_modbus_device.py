@@ -152,7 +152,7 @@ class TestTrip:
 
     def test_unknown_output_is_refused(self, driven, soft):
         """With no safe value in a register or in the experiment, nobody knows where it is."""
-        made = driven(soft(safe=""), watchdog=TRIPPED)
+        made = driven(soft(on_trip="stored", safe=""), watchdog=TRIPPED)
         trip(made, 3.0)
         device = made.another(watchdog="none")
         before = made.writes()
