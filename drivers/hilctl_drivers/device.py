@@ -141,7 +141,7 @@ class DacDevice(ABC):
                 displacement_um = float(np.interp(displacement_um, *self._curve))
             measured = np.full(1, np.nan)
             self._measure_output(measured)
-            return DeviceReadings(displacement_um, output, measured.item())
+            return DeviceReadings(displacement_um, output, measured.item(), self._tripped())
         except DeviceError as error:
             raise self._error(action, str(error)) from None
         finally:
@@ -279,6 +279,10 @@ class DacDevice(ABC):
     def _look(self) -> tuple[float, float | None]:
         """Connect, and return displacement and output; :meth:`_release` follows."""
         raise DeviceError("it can't be read without being set up")
+
+    def _tripped(self) -> bool:
+        """Return whether the device's watchdog has tripped; False if it cannot be known."""
+        return False
 
     def _measure_output(self, measured: F64) -> None:
         """Set ``measured[0]`` to the command as measured; NaN if it is not measured."""

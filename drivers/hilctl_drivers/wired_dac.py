@@ -36,6 +36,7 @@ class WiredDac(DacDevice):
     measures = False  # whether exchanges fill ``measured``
     longest_message_s = 0.0  # longest delay of the safe value by a running exchange
     arm_s = 0.0  # longest time to arm the watchdog
+    reads_output = True  # whether the output can be read before a run
     unconfirmed = ""  # why a written value cannot be confirmed; empty if it can
     _reader: SensorReader | None = None  # None if the input is read with each exchange
 
@@ -73,6 +74,7 @@ class WiredDac(DacDevice):
             fifo_depth=self.fifo_depth,
             latency_blocks=options.fifo_blocks if streams else 0,
             measures_command=self.measures,
+            reads_output=self.reads_output,
             arm_s=0.0 if options.watchdog == "none" else self.arm_s,
             safe_note="; ".join(filter(None, (self._late_note(), self.unconfirmed))),
             confirms=not self.unconfirmed,

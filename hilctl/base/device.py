@@ -112,6 +112,8 @@ class DeviceInfo:
             same exchange; more for a device that plays blocks from a FIFO and sets the pace:
             :meth:`Device.exchange` then waits for its clock.
         measures_command: Whether :meth:`Device.exchange` fills ``measured``.
+        reads_output: Whether :meth:`Device.output` returns the output. False if it always returns
+            None; then a run needs ``safe.at_start``.
         ages_readings: Whether the device is an :class:`AgingDevice`: its sensor sends unasked.
         holds: Resources that it uses exclusively while open, with a name common to all devices
             (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``). Empty for a device without such a
@@ -153,6 +155,7 @@ class DeviceInfo:
     fifo_depth: int = 0
     latency_blocks: int = 0
     measures_command: bool = False
+    reads_output: bool = True
     ages_readings: bool = False
     holds: tuple[str, ...] = ()
     simulated: bool = False
@@ -322,6 +325,7 @@ class DeviceReadings(NamedTuple):
     displacement_um: float
     output: float | None  # in the command's unit; None if unknown
     measured: float = math.nan  # command as measured by the device; NaN if it is not measured
+    tripped: bool = False  # whether the device's watchdog has tripped, if that can be read
 
 
 @runtime_checkable

@@ -197,6 +197,8 @@ def print_probed(probed: Probed) -> None:
         print(f"displacement: {probed.displacement_um:.6g} µm")
     output = probed.output
     print(f"output: {'unknown' if output is None else f'{output:.6g} {probed.command_unit}'}")
+    if probed.tripped:
+        print("watchdog: tripped; 'hilctl safe' sets the safe value and clears the trip")
     if probed.measured is not None:
         print(f"measured output: {probed.measured:.6g} {probed.command_unit}")
     for key, value in probed.details.items():

@@ -33,6 +33,17 @@ def pace_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
     )
 
 
+def start_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
+    """Return a warning if the start of a run will need the output, which is not known."""
+    if info.reads_output or config.safe.at_start is not None:
+        return ()
+    return (
+        f"safe.at_start: a run needs it, because {info.name} cannot read its output, where the "
+        f"initial ramp begins. Measure the output before each run, and set it in "
+        f"{info.command_unit}.",
+    )
+
+
 def calibration_warnings(info: DeviceInfo, now_s: float) -> tuple[str, ...]:
     """Return a warning for each calibration that is too old at a Unix time."""
     if info.calibration is None:

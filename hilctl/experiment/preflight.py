@@ -26,7 +26,12 @@ from hilctl.experiment.closed_loop import (
 )
 from hilctl.experiment.coil_heat import CoolingCoil
 from hilctl.experiment.conditioning import condition_problems, conditioning_of, measures_offset
-from hilctl.experiment.device_rules import calibration_warnings, device_problems, pace_warnings
+from hilctl.experiment.device_rules import (
+    calibration_warnings,
+    device_problems,
+    pace_warnings,
+    start_warnings,
+)
 from hilctl.experiment.device_state import (
     CompensatorStart,
     InitialState,
@@ -149,6 +154,7 @@ def check(
             raise ConfigError([at_worst(each) for each in found])
     info = loaded.device.info
     warnings += (*pace_warnings(config, info), *calibration_warnings(info, now_s))
+    warnings += start_warnings(config, info)
     warnings += tuple(_clamped(loaded, forecast))
     return CheckedExperiment(
         loaded, reference, forecast, begun, warnings, heat_a2, operator, findings.expected

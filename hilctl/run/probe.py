@@ -25,6 +25,7 @@ class Probed:
     displacement_um: float | None  # None if the sensor is not available without a run
     output: float | None  # output in ``command_unit``; None if unknown
     measured: float | None  # output as measured by the device; None if it is not
+    tripped: bool  # whether the device's watchdog has tripped, if that can be read
     command_unit: str
     faults: tuple[str, ...]  # implausible values, each with a possible cause
 
@@ -35,7 +36,7 @@ def probe(path: Path, settings: list[str]) -> Probed:
     loaded = load_experiment(path, settings)
     info = loaded.device.info
     with held_devices(info.holds):
-        displacement_um, output, measured = _read(loaded, loaded.device)
+        displacement_um, output, measured, tripped = _read(loaded, loaded.device)
     return Probed(
         name=info.name,
         description=info.description,
@@ -46,17 +47,20 @@ def probe(path: Path, settings: list[str]) -> Probed:
         displacement_um=displacement_um,
         output=output,
         measured=None if math.isnan(measured) else measured,
+        tripped=tripped,
         command_unit=info.command_unit,
         faults=judge(info, displacement_um, output),
     )
 
 
-def _read(loaded: LoadedExperiment, device: Device) -> tuple[float | None, float | None, float]:
+def _read(
+    loaded: LoadedExperiment, device: Device
+) -> DeviceReadings | tuple[None, float | None, float, bool]:
     if isinstance(device, ReadableDevice) and not device.info.simulated:
         return DeviceReadings(*device.look())
     device.open(loaded.config.sample_rate_hz, loaded.config.block)
     try:
-        return None, device.output(), math.nan
+        return None, device.output(), math.nan, False
     finally:
         device.close()
 

@@ -10,6 +10,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     AsciiExchange,
     AsciiOutput,
     AsciiProfile,
+    Readback,
     binary_format,
     fill,
 )
@@ -45,6 +46,13 @@ class AsciiDac(SteppedDac, SerialDac):
         self._combined: AsciiExchange | None = None
         if combined != "none" and (combined.output, combined.input) == own:
             self._combined = combined
+        readback, watchdog = self._target.readback, self._profile.watchdog
+        self._readback: Readback | None = None
+        # An undetectable trip may have changed the output since the last command.
+        blind = watchdog != "none" and watchdog.tripped == "none"
+        if readback != "none" and not (blind and readback.of == "command"):
+            self._readback = readback
+        self.reads_output = self._readback is not None
         # Half duplex: what was asked last is answered before the safe value can go out.
         write = exchange_time(self._profile, options.output, None)
         busy = self._own_time()
@@ -99,19 +107,22 @@ class AsciiDac(SteppedDac, SerialDac):
         self._feed()
 
     def _held(self) -> float | None:
-        readback, watchdog = self._target.readback, self._profile.watchdog
-        if readback == "none":
+        if self._readback is None:
             return None
-        # An undetectable trip may have changed the output since the last command.
-        if readback.of == "command" and watchdog != "none" and watchdog.tripped == "none":
-            return None
-        return self._target.value(self._writer.number(readback))
+        return self._target.value(self._writer.number(self._readback))
 
     def _look(self) -> tuple[float, float | None]:
         self._connect()
         displacement_um = self._chain.displacement_um(self._reader.read())
         output = self._measured_output()
+        # A wrong query must show here: a run asks these last.
+        if self._target.readback != "none":
+            self._writer.number(self._target.readback)
+        self._writer.check_errors()
         return displacement_um, None if output is None else self._chain.command(output)
+
+    def _tripped(self) -> bool:
+        return self._writer.tripped()
 
     def _close(self) -> None:
         super()._close()
@@ -136,7 +147,7 @@ class AsciiDac(SteppedDac, SerialDac):
             if source.measures == "output" and source.unit == unit:
                 return self._writer.value(source)
         readback = self._target.readback
-        if readback != "none" and readback.of == "command" and self._writer.tripped():
+        if readback != "none" and readback.of == "command" and self._tripped():
             return None
         return self._held()
 

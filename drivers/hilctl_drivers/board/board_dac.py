@@ -100,6 +100,7 @@ class BoardDac(SerialDac):
         if setup.reads_elsewhere:
             self._reader = setup.reader_on(self._link)
         self._safe = setup.chain.output(self._options.safe_command)
+        self.reads_output = profile.protocol != "hilctl-1"
         self.arm_s = _wire_time(profile, watchdog_sizes(_value_bytes(profile))).answered_s
 
     def _rates(self, block: int) -> RateLimit:
@@ -120,6 +121,9 @@ class BoardDac(SerialDac):
             self._reader.open()
             reading = self._reader.read()
         return self._chain.displacement_um(reading), self._chain.command(state.output)
+
+    def _tripped(self) -> bool:
+        return self._session.known_state().tripped
 
     def _send(self, value: float) -> None:
         self._link.send_now(self._session.safe_frame(value))

@@ -52,6 +52,7 @@ class ModbusDevice(SteppedDac):
         self._may_combine = (
             self._profile.exchange != "none" and readback is not None and not setup.reads_elsewhere
         )
+        self.reads_output = readback is not None
         setup.check_timeout(self._wire(self._may_combine))
 
     def _wire(self, one_transaction: bool) -> WireTime:
@@ -149,7 +150,7 @@ class ModbusDevice(SteppedDac):
         return self._writer.held(self._target)
 
     def _look(self) -> tuple[float, float | None]:
-        setup, writer = self._setup, self._writer
+        setup = self._setup
         self._connect()
         reading, held = self._reader.read(), self._held()
         for name, value in ((setup.options.input, reading), (setup.options.output, held)):
@@ -159,11 +160,14 @@ class ModbusDevice(SteppedDac):
                     "(ABCD, CDAB, ...) and type in the profile with the device's manual"
                 )
         displacement_um = setup.chain.displacement_um(reading)
-        watchdog = writer.profile.watchdog
-        flag = "none" if watchdog == "none" else watchdog.tripped
-        if held is None or (flag != "none" and writer.is_set(flag)):
+        if held is None or self._tripped():
             return displacement_um, None  # the register keeps the last command
         return displacement_um, setup.chain.command(held)
+
+    def _tripped(self) -> bool:
+        watchdog = self._profile.watchdog
+        flag = "none" if watchdog == "none" else watchdog.tripped
+        return flag != "none" and self._writer.is_set(flag)
 
     def _send(self, value: float) -> None:
         assert isinstance(self._link, StreamLink)

@@ -85,7 +85,7 @@ def test_required_options_are_marked(capsys):
 
 PROBED = Probed(
     "rig", "a [bold] device", 1000.0, "", "up to 0.3 s", {"firmware": "[1.2]"},
-    2.8e20, None, 1.5, "A", ("too far",),
+    2.8e20, None, 1.5, True, "A", ("too far",),
 )  # fmt: skip
 
 
@@ -97,6 +97,7 @@ def test_answers_of_a_device_are_printed_without_markup(capsys):
     assert "1000 samples per second\n" in shown
     assert "displacement: 2.8e+20 µm" in shown
     assert "output: unknown" in shown
+    assert "watchdog: tripped" in shown
     assert "measured output: 1.5 A\n" in shown
     assert "safe value: up to 0.3 s" in shown
     assert "fault: too far" in shown

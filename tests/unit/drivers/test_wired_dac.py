@@ -306,6 +306,7 @@ def test_an_output_that_nobody_can_read_back_is_not_known(rig, profiles):
     old.write_text(old.read_text().replace("hilctl-2", "hilctl-1"))
     adam = rig("adam_4024_ascii", reader="agilent_34970a", own_line=True)
     for bench in (rig("dcon"), rig("cobs"), adam):
+        assert not bench.device.info.reads_output
         bench.device.open(10.0, 1)
         assert bench.device.output() is None
         bench.device.make_safe(1.0)
@@ -323,7 +324,8 @@ def test_looking_changes_nothing(rig, kind):
     bench.device._block = 0
     bench.pass_s(6.0)  # each second takes the emulated rig time, too
     before = bench.events()
-    displacement_um, output, _ = bench.device.look()
+    displacement_um, output, _, tripped = bench.device.look()
+    assert tripped == bool(watched)
     held = 3.0 if kind == "scpi" else 0.0  # tripped
     assert output == pytest.approx(held, abs=2e-3)
     assert displacement_um == pytest.approx(bench.emulator.device._rig.displacement_um, abs=0.5)

@@ -11,7 +11,12 @@ import pytest
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
 from hilctl.experiment import device_rules
-from hilctl.experiment.device_rules import calibration_warnings, interlock_context, pace_warnings
+from hilctl.experiment.device_rules import (
+    calibration_warnings,
+    interlock_context,
+    pace_warnings,
+    start_warnings,
+)
 from hilctl.experiment.load import load_experiment, resolve
 from hilctl.experiment.preflight import check
 from hilctl.loop.interlocks import Interlocks
@@ -216,6 +221,15 @@ def warned(*settings, **info):
 def test_ticks_of_less_than_a_tenth_of_a_millisecond_are_told(block, told):
     """The demo has 50 kHz."""
     assert bool(warned(f"block={block}")) == told
+
+
+@pytest.mark.parametrize(("reads", "at_start", "warnings"), [
+    (True, "null", 0), (False, "0.5", 0), (False, "null", 1),
+])  # fmt: skip
+def test_an_output_that_cannot_be_read_is_told(reads, at_start, warnings):
+    loaded = load_experiment(DEMO, [f"safe.at_start={at_start}"])
+    info = replace(loaded.device.info, reads_output=reads)
+    assert len(start_warnings(loaded.config, info)) == warnings
 
 
 @pytest.mark.parametrize(("now", "warnings"), [("2027-01-31", 0), ("2027-02-02", 1)])

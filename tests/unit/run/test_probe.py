@@ -10,7 +10,8 @@ import pytest
 import yaml
 
 from hilctl.base.device import DeviceInfo
-from hilctl.base.errors import InputError
+from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.yaml import dump
 from hilctl.experiment.devices import device_class
 from hilctl.run.probe import judge, probe
 from hilctl.run.run_folder import held_devices
@@ -112,6 +113,7 @@ def test_a_trip_stays_and_no_stale_command_takes_effect(rig, profile):
     probed.clock.pass_s(1.0)
     found = probe(probed.experiment, [])
     assert probed.emulator.device.tripped
+    assert found.tripped
     events = logged(probed.log)
     current_a = [each["current_a"] for each in events if "current_a" in each]
     assert current_a[-2:] == [pytest.approx(3.0, abs=1e-2), 0.0]
@@ -137,6 +139,19 @@ def test_a_measured_output_is_read_too(rig):
     probed = rig("kepco_bop", reader="agilent_34970a", measure="current")
     probed.drive(3.0)
     assert probe(probed.experiment, []).measured == pytest.approx(3.0, abs=1e-2)
+
+
+@pytest.mark.parametrize("query", ["readback", "error_query"])
+def test_a_wrong_query_of_the_output_is_found(rig, query):
+    """A run asks it last."""
+    probed = rig("kepco_bop", reader="agilent_34970a", measure="current")
+    profile = Path(probed.device["profile"])
+    data = yaml.safe_load(profile.read_text(encoding="utf-8"))
+    section = data["outputs"]["current"] if query == "readback" else data
+    section[query] |= {"pattern": "A([0-9])", "example": "A1"}
+    profile.write_text(dump(data), encoding="utf-8")
+    with pytest.raises(DeviceError, match=re.escape(section[query]["ask"])):
+        probe(probed.experiment, [])
 
 
 def test_a_wrong_word_order_is_found(rig):
