@@ -17,7 +17,7 @@ OutputState: TypeAlias = Literal["confirmed", "set", "sent", "unknown"]
 """State of the output at the end of a run.
 
 ``confirmed``: the device confirmed the safe value, and no older command can follow.
-``set``: the device confirmed the safe value, but an older unanswered command may still be executed.
+``set``: the device confirmed the safe value, but an unconfirmed older one may still be executed.
 ``sent``: the safe value was sent to a device that cannot confirm it.
 ``unknown``: the safe value is not confirmed.
 """
@@ -42,7 +42,7 @@ _OWN_ERRORS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS}
 _DESCRIPTIONS: dict[OutputState, str] = {
     "confirmed": "the output is at its safe value, confirmed by the device",
     "set": "the safe value is set, but not yet confirmed to hold: "
-    "an older command that was never answered may still be executed",
+    "an older command that the device did not confirm may still be executed",
     "sent": "the safe value was sent, but could not be confirmed: this device cannot report it",
     "unknown": "the safe value could not be confirmed",
 }
@@ -89,7 +89,7 @@ class SafeGoal:
         value: The safe value, in the device's command unit.
         ramp_per_s: Slew rate of the ramp, > 0.
         start: Last command; None if unknown, then there is no ramp.
-        pending: Whether an unanswered command may still be executed.
+        pending: Whether an unconfirmed command may still be executed.
     """
 
     value: float
