@@ -29,11 +29,14 @@ from hilctl_drivers.simulated.devices import (
     PiezoOptions,
     PiezoStage,
     SimulatedDevice,
+    SimulatedTerfenol,
     TerfenolOptions,
 )
 
 AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard | EmulatedStream
 _DRIVE_V, _RANGE_UM = 100.0, 50.0  # of a piezo stage if no wiring is given
+_RANGE_SHARE = 0.8  # of the sensor's range, the most that rods move in the limits of an experiment
+_SETTLED_NS = 100_000_000
 
 
 class ListenAddress(NamedTuple):
@@ -269,6 +272,11 @@ def _rig(
         # What the user has stated is stronger.
         rated = {"rated_current_a": max(map(abs, limits))} | actuator.model_dump(exclude_unset=True)
         actuator = TerfenolOptions.model_validate(rated)
+        if wiring is not None and "vary" not in rated:
+            range_um = max(map(abs, wiring.displacement_range))
+            strain = _RANGE_SHARE * range_um / _stroke_um(actuator, max(limits, key=abs))
+            rated["vary"] = {"strain": min(1.0, strain)}
+            actuator = TerfenolOptions.model_validate(rated)
     if isinstance(actuator, PiezoOptions) and (actuator.physics, actuator.stage) == ("plays", None):
         if wiring is None:  # 0 V of an output drives with 0 V
             share = min(0.0, output.min) / max(abs(output.min), abs(output.max))
@@ -289,6 +297,14 @@ def _rig(
             f"{wiring.command_unit}: use --unit {wiring.command_unit}"
         )
     return device, wiring
+
+
+def _stroke_um(actuator: TerfenolOptions, command: float) -> float:
+    """Return the displacement of an actuator some time after a step to a command, um."""
+    rig = Rig(0, SimulatedTerfenol(actuator))
+    rig.put_out(command, 0)
+    rig.advance(_SETTLED_NS)
+    return abs(rig.displacement_um)
 
 
 def _chosen(what: str, name: str | None, names: list[str], profile: BaseProfile) -> str:

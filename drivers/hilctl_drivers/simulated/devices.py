@@ -230,7 +230,9 @@ class Variation(DeviceOptions):
 
     lag: Factor = Field(default=1.0, description="time constant of the field")
     pinning: Factor = Field(default=1.0, description="pinning fields, the width of the loops")
-    strain: Factor = Field(default=1.0, description="displacement, the gain of the rig")
+    strain: float = Field(
+        default=1.0, gt=0.0, le=2.0, description="displacement, the gain of the rig"
+    )
     resonance: Factor = Field(default=1.0, description="natural frequency, by the stiffness")
     damping: Factor = Field(default=1.0, description="damping ratio")
 

@@ -61,6 +61,18 @@ def test_the_limits_rate_the_actuator(emulate):
     assert piezo_um == pytest.approx(0.8 * 50.0, rel=0.01)
 
 
+@pytest.mark.parametrize(("um_per_v", "stroke_um"), [(1.0, (7.9, 8.1)), (100.0, (30.0, 100.0))])
+def test_rods_keep_to_the_range_of_the_sensor(emulate, um_per_v, stroke_um):
+    """They move less with a smaller range, and not more with a larger one."""
+    wiring = Amplifier(gain_a_per_v=1.0), Sensor(um_per_v=um_per_v)
+    made = emulate("labjack_t7", wiring=wiring, limits=(0.0, 2.0), command=0.0)
+    rig = made.device._rig
+    rig.put_out(2.0, made.now_ns)
+    rig.advance(made.now_ns + 100 * MS)
+    low, high = stroke_um
+    assert low < rig.displacement_um < high
+
+
 @pytest.mark.parametrize(("profile", "options", "words"), [
     ("waveshare_ao_8ch", {}, "has no input to show a displacement at: name a reader"),
     ("waveshare_ai_8ch", {}, "has no output to drive .*: it can be another one's reader"),
