@@ -110,7 +110,10 @@ def _place(made: StartingSection, prefix: str, profile: BaseProfile) -> dict[str
         where["host"] = _HERE
         # Two devices cannot have one place: at addresses of their own both have the usual port.
         port = getattr(profile.link, "port", 0)
-        where["tcp_port"] = port + (port == made.values.get("tcp_port"))
+        taken = port == made.values.get("tcp_port")
+        where["tcp_port"] = port + taken
+        if taken:
+            made.remarks[f"{prefix}tcp_port"] = f"set: {port} if the host is not that of the output"
         remark = "name or address; this machine is hilctl emulate's"
         _ask(made, f"{prefix}host", f"name or address of the {profile.title}", remark)
     else:

@@ -19,7 +19,14 @@ from hilctl.base.formatting import finite_json
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, load_document
 from hilctl_drivers.emulator.factory import Emulator, build
-from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLine, parse_fault
+from hilctl_drivers.emulator.options import (
+    KINDS,
+    LASTING,
+    EmulatorOptions,
+    LinkKind,
+    ReaderLine,
+    parse_fault,
+)
 from hilctl_drivers.emulator.rig import ACTUATORS
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import NamedProfile, shipped_profiles
@@ -173,7 +180,11 @@ def emulate(
     log: Annotated[Path | None, typer.Option(help="Log file for every write.")] = None,
     fault: Annotated[
         list[str] | None,
-        typer.Option(metavar="KIND@WHEN", help="KIND@COUNT or KIND@SECONDSs; may be repeated."),
+        typer.Option(
+            metavar="KIND@WHEN",
+            help="Fault at request KIND@COUNT or time KIND@SECONDSs; may be repeated. Kinds: "
+            f"{', '.join(KINDS)}. {', '.join(LASTING)} take a duration: delay:0.3@500.",
+        ),
     ] = None,
     output: Annotated[str | None, typer.Option(help="Output that drives the rig.")] = None,
     sensor: Annotated[
@@ -203,7 +214,9 @@ def emulate(
     command: Annotated[
         float | None,
         typer.Option(
-            "--command", "--current-a", help="Initial command, A or V; default: as after power-up."
+            "--command",
+            "--current-a",
+            help="Initial command, A or V, for Modbus profiles; default: as after power-up.",
         ),
     ] = None,
     as_json: Annotated[

@@ -19,7 +19,7 @@ FaultKind: TypeAlias = Literal[
 ]  # fmt: skip
 KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
 DELAY_S = 1.0
-_LASTING = ("delay", "late", "invalid", "stall")
+LASTING = ("delay", "late", "invalid", "stall")
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +47,8 @@ def parse_fault(text: str) -> WireFault:
     kind, delay, at, seconds = found.groups()
     if kind not in KINDS:
         raise InputError(f"fault must be one of {', '.join(KINDS)}, got {kind!r}")
-    if delay is not None and kind not in _LASTING:
-        raise InputError(f"only {', '.join(_LASTING)} take a time before the @, got {text!r}")
+    if delay is not None and kind not in LASTING:
+        raise InputError(f"only {', '.join(LASTING)} take a time before the @, got {text!r}")
     fault = WireFault(cast("FaultKind", kind), delay_s=float(delay or DELAY_S))
     if seconds:
         return replace(fault, at_s=float(at))

@@ -47,6 +47,21 @@ def test_the_sensor_may_be_on_another_device(name, reader, line):
     assert bool(placed) == (line == "own")
 
 
+def test_a_port_that_only_a_shared_host_needs_is_marked():
+    section = starting_section("adam_6224", "A", "adam_6217")
+    assert (section.values["tcp_port"], section.values["reader"]["tcp_port"]) == (502, 503)
+    assert section.remarks["reader.tcp_port"].startswith("set: 502")
+    assert "tcp_port" not in section.remarks
+
+
+@pytest.mark.parametrize(("name", "reader", "marked"), [
+    ("icp_m7024", "icp_m7017", True), ("labjack_t7", None, False),
+])  # fmt: skip
+def test_a_value_that_the_device_stores_is_marked(name, reader, marked):
+    remarks = starting_section(name, "A", reader).remarks
+    assert ("watchdog.safe_command" in remarks) == marked
+
+
 def test_a_position_that_begins_at_zero_rests_in_the_middle():
     section = starting_section("kepco_bop", "A", "capancdt_6200")
     assert section.values["sensor"] == {"offset_um": -100.0}
