@@ -58,12 +58,14 @@ class _Broken(NamedTuple):
         loc: Keys and indices without pydantic's names of union members.
         parent: The model with the last key, if any.
         of_choice: Whether the value has the wrong type for one of several union members.
+        kinds: Possible kinds of the value, if it needs one.
     """
 
     detail: ErrorDetails
     loc: Loc
     parent: type[BaseModel] | None
     of_choice: bool
+    kinds: tuple[str, ...]
 
 
 def dotted(loc: Loc) -> str:
@@ -107,7 +109,7 @@ def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> Conf
     rule = ", or ".join([rule, *(other.removeprefix("must be ") for other in others)])
     if first.detail["type"] == "value_error":  # a rule on several keys begins with the key
         place = (*loc, *loc_of(rule.split(" ", 1)[0]))
-    known = first.parent.model_fields if first.parent else ()
+    known = first.kinds or (first.parent.model_fields if first.parent else ())
     hint = next(filter(None, (_hint(each.detail, known) for each in group)), "")
     return ConfigProblem(where(place), dotted(loc), rule, _value(first.detail), hint)
 
@@ -129,6 +131,8 @@ def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
     value, kind = detail["input"], detail["type"]
     if kind == "extra_forbidden":
         return did_you_mean(str(detail["loc"][-1]), known)
+    if kind == "union_tag_not_found":
+        return f"one of {', '.join(known)}"
     if kind in WORDS:  # the rule lists all of them
         given, words = detail.get("ctx", {}).get("tag", value), _QUOTED.findall(expected(detail))
         if given in words:  # written as Python does, so with an escape
@@ -191,7 +195,10 @@ def _located(model: type[BaseModel], detail: ErrorDetails) -> _Broken:
     if kind == "union_tag_invalid":
         plain.append("kind")
     of_choice = chose and (kind == "literal_error" or kind.endswith("_type"))
-    return _Broken(detail, tuple(plain), parent, of_choice)
+    kinds: tuple[str, ...] = ()
+    if kind == "union_tag_not_found":
+        kinds = tuple(name for each in choices for name in _kinds(each))
+    return _Broken(detail, tuple(plain), parent, of_choice, kinds)
 
 
 def _is_model(annotation: Any) -> bool:
@@ -207,8 +214,13 @@ def _is_named(choice: Any, name: str | int) -> bool:
         return False
     if re.search(rf"\b{choice.__name__}\]*$", str(name)):
         return True
-    kind = choice.model_fields.get("kind")
-    return kind is not None and name in typing.get_args(kind.annotation)
+    return name in _kinds(choice)
+
+
+def _kinds(choice: Any) -> tuple[Any, ...]:
+    """Return the kinds of a union member; none if it has no such key."""
+    kind = choice.model_fields.get("kind") if _is_model(choice) else None
+    return () if kind is None else typing.get_args(kind.annotation)
 
 
 def _inner(annotation: Any, part: str | int) -> Any:

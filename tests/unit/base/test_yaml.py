@@ -132,7 +132,7 @@ def test_every_value_has_its_line(loc, place):
     ("kind: square", "kind: sqare",
      "bench.yaml:8: parts.1.kind: must be one of 'round', 'square', got 'sqare' "
      "(did you mean 'square'?)"),
-    ("kind: square\n    ", "", "bench.yaml:8: parts.1: needs a 'kind'"),
+    ("kind: square\n    ", "", "bench.yaml:8: parts.1: needs a 'kind' (one of round, square)"),
     ("parts:", "colours: {red: x}\nparts:",
      "bench.yaml:5: colours.red: must be a number, got 'x'"),
 ])  # fmt: skip
