@@ -102,7 +102,8 @@ class RunReport(RunMetrics):
         duration_s: Duration of the waveform.
         command_unit: ``A`` or ``V``, of ``command_min`` and ``command_max``.
         limited_samples: Samples of the waveform that the limiter changed.
-        sensor_invalid_samples: Samples of the waveform with an invalid displacement.
+        sensor_invalid_samples: Samples of the waveform whose displacement is invalid or
+            outside the stroke limits.
         reading_age_max_s: Largest age of a reading; None unless the sensor sends unasked.
         lost_readings: Readings of such a sensor that did not arrive.
         zero_um: Zero of the sensor, subtracted from its readings; None without one.
@@ -192,7 +193,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("displacement", _range(report.displacement_min_um, report.displacement_max_um, "um")),
         *((name, _aux(each)) for name, each in report.aux.items()),
         ("limited samples", f"{report.limited_samples:,}"),
-        ("invalid readings", f"{report.sensor_invalid_samples:,}"),
+        ("rejected readings", f"{report.sensor_invalid_samples:,}"),
         *([("sensor zero", zero)] if report.zero_um is not None else []),
         *([("reading age", age)] if report.reading_age_max_s is not None else []),
         ("ticks", f"{_count(report.late_ticks)} late, {_count(report.skipped_ticks)} skipped"),

@@ -150,7 +150,7 @@ def print_inventory(listed: Mapping[str, Any]) -> None:
 
 def print_described(described: DeviceDescription) -> None:
     """Print the options of a device, or the content of a profile."""
-    print(f"{described.name}: {described.place}")
+    print(": ".join(dict.fromkeys((described.name, described.place))))
     if described.options:
         rows = [
             (each.name, "required" if each.default is None else each.default, each.description)

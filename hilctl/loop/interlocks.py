@@ -298,10 +298,11 @@ class Interlocks:
         return Trip(sample, "tracking_error", f"{error} is {beyond}")
 
     def _invalid(self, sample: int, displacement_um: float) -> Trip:
-        reading = f"displacement {displacement_um:.4g} µm at sample {sample}"
         if math.isnan(displacement_um):
-            text = f"{reading} is no valid reading{for_longer_than(self.settings.sensor_invalid_s)}"
+            since = for_longer_than(self.settings.sensor_invalid_s)
+            text = f"displacement at sample {sample} is no valid reading{since}"
             return Trip(sample, "stroke", text)
+        reading = f"displacement {displacement_um:.4g} µm at sample {sample}"
         low, high = self.context.sensor_um
         if math.isfinite(displacement_um) and not low < displacement_um < high:
             text = f"{reading} is at an end of the sensor's range, {low:g} to {high:g} µm"

@@ -91,7 +91,7 @@ def test_impatience_does_not_skip_the_ramp(tmp_path):
 
 @pytest.mark.parametrize(
     ("kind", "words"),
-    [("sensor_nan", "nan µm at sample 9000"), ("sensor_jump", "stroke limits -60 to 60 µm")],
+    [("sensor_nan", "displacement at sample 9000"), ("sensor_jump", "stroke limits -60 to 60 µm")],
 )
 def test_bad_sensor_ramps_down(tmp_path, kind, words):
     """A reading that can't be trusted ends the run by its ramp."""
