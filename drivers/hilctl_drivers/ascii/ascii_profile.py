@@ -184,7 +184,7 @@ class Reply(StrictModel):
     @model_validator(mode="after")
     def _fits(self) -> Self:
         if self.match(self.example) is None:
-            raise ValueError(f"pattern {self.pattern!r} must match the example {self.example!r}")
+            raise ValueError(f"pattern '{self.pattern}' must match the example '{self.example}'")
         return self
 
     @property
@@ -211,7 +211,7 @@ class NumberReply(Reply):
     def _has_number(self) -> Self:
         match = self.match(self.example)
         if match is None or match.re.groups != 1:
-            raise ValueError(f"pattern {self.pattern!r} must have one group, around the number")
+            raise ValueError(f"pattern '{self.pattern}' must have one group, around the number")
         if self.binary is not None:
             return self
         try:
@@ -465,8 +465,11 @@ class AsciiProfile(BaseProfile):
     def _exchange_channels(self) -> Self:
         if self.exchange == "none":
             return self
-        if self.exchange.output not in self.outputs or self.exchange.input not in self.inputs:
-            raise ValueError("exchange.output and exchange.input must be an output and an input")
+        for key, known in (("output", self.outputs), ("input", self.inputs)):
+            name = getattr(self.exchange, key)
+            if name not in known:
+                names = ", ".join(known) or "none"
+                raise ValueError(f"exchange.{key} must be an {key} ({names}), got {name}")
         self.outputs[self.exchange.output].check_write("exchange.write", self.exchange.write)
         if "\n" in self.exchange.write and self.link.silence_s:
             raise ValueError(
@@ -494,7 +497,7 @@ class AsciiProfile(BaseProfile):
         for name, answer in answers.items():
             for error in self.errors:
                 if answer != "none" and error.match(answer.example):
-                    raise ValueError(f"errors: {error.pattern!r} matches the {name}")
+                    raise ValueError(f"errors: '{error.pattern}' matches the {name}")
         return self
 
     def misfits(self) -> Iterator[tuple[str, str, str]]:

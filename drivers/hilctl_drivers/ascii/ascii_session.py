@@ -98,7 +98,8 @@ class LineFormat:
         if end < 0 and len(data) < self.size_max + len(self.terminator):
             raise IncompleteError(f"{data!r} without {self.terminator!r}")
         if end != len(data) - len(self.terminator):
-            raise CorruptError(f"must be one line that ends in {self.terminator!r}, got {data!r}")
+            rule = f"must be one line that ends in {self.terminator!r} (reply_terminator)"
+            raise CorruptError(f"{rule}, got {data!r}")
         return self._text(data[:end])
 
     def messages(self, received: bytearray) -> Iterator[str]:
@@ -132,7 +133,8 @@ class LineFormat:
             raise CorruptError(f"a line has at most {self.size_max} bytes, got {len(body)}")
         text = body.decode("latin-1")
         if not _is_text(text):
-            raise CorruptError(f"a line must be printable ASCII, got {body!r}")
+            ends = " (compare link.reply_terminator)" if body[-1:] in b"\r\n" else ""
+            raise CorruptError(f"a line must be printable ASCII, got {body!r}{ends}")
         split = max(0, len(body) - _CHECKSUM_CHARS[self.checksum])
         want = _CHECKSUMS[self.checksum](body[:split])
         if body[split:] != want:
@@ -324,7 +326,13 @@ class AsciiSession:
         """Run the self-test; raise DeviceError if it is another device."""
         test = self.profile.selftest
         if test != "none":
-            text, reply = self._ask(test)
+            try:
+                text, reply = self._ask(test)
+            except NoAnswerError as error:
+                if isinstance(self.profile.link, BytesLink):
+                    raise
+                keys = "link.terminator and link.reply_terminator"
+                raise NoAnswerError(f"{error}; compare {keys} with the manual") from None
             if not test.match(reply):
                 raise DeviceError(f"{text} must be answered like {test.example!r}, got {reply!r}")
 

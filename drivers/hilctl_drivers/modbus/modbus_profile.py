@@ -17,6 +17,7 @@ from hilctl_drivers.modbus.register_map import (
     RegisterStep,
     StatusRegister,
     Validity,
+    address_span,
     wire_address,
 )
 from hilctl_drivers.profile_base import (
@@ -259,8 +260,8 @@ class ModbusProfile(BaseProfile):
             if not 0 <= address <= 65_536 - register.words:
                 base = self.address_base if register.address_base is None else register.address_base
                 raise ValueError(
-                    f"{where}.address must be in area {register.area} with address_base {base},"
-                    f" got {register.address}"
+                    f"{where}.address must be {address_span(register, base)} in area"
+                    f" {register.area} with address_base {base}, got {register.address}"
                 )
         channels = (*self.outputs.items(), *self.inputs.items())
         for (name, one), (other, two) in combinations(channels, 2):

@@ -316,6 +316,16 @@ class Validity(StatusRegister):
         return self
 
 
+def address_span(register: Register, base: AddressBase) -> str:
+    """Return the addresses that a register may have, in words."""
+    last = 65_536 - register.words
+    if base != "modicon":
+        return f"{base} to {last + base}"
+    if (digit := _MODICON[register.area]) == 0:
+        return f"1 to {last + 1}"
+    return f"{digit}0001 to {digit}9999 or {digit}00001 to {digit * 100_000 + last + 1}"
+
+
 def wire_address(register: Register, base: AddressBase) -> int:
     """Return the address in the frame; outside 0 to 65535 if there is none.
 

@@ -62,7 +62,7 @@ class WireTime:
         durations_s = {
             "request": self.request_s,
             "reply": self.reply_s,
-            f"{self.gaps} {'gap' if self.gaps == 1 else 'gaps'}": self.gaps_s,
+            f"{self.gaps} gaps" if self.gaps > 1 else "gap": self.gaps_s,
             "turnaround": self.turnaround_s,
             "settling": self.settle_s,
         }
@@ -71,7 +71,7 @@ class WireTime:
             for name, seconds in durations_s.items()
             if seconds > 0.0 or name == "turnaround"
         )
-        return f"{self.what}: {parts} -> at most {self.highest_rate_hz:.0f} Hz"
+        return f"{self.what}: {parts}"
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,7 +87,8 @@ class RateLimit:
         """Return the limit of the wire, or that of the device (from ``whose``) if it is lower."""
         if wire.highest_rate_hz <= most_hz:
             return cls(wire.highest_rate_hz, str(wire), lowest_hz)
-        return cls(most_hz, f"{whose} says so; the wire alone: {wire}", lowest_hz)
+        alone = f"{wire} -> at most {wire.highest_rate_hz:.4g} Hz"
+        return cls(most_hz, f"{whose} says so; the wire alone: {alone}", lowest_hz)
 
     def check(self, rate_hz: float) -> None:
         """Raise DeviceError for a sample rate outside the limits."""

@@ -104,6 +104,17 @@ def test_the_wrong_device_is_told_by_its_answer():
         session(b"!024017\r").check_selftest()
 
 
+def test_another_end_of_line_names_its_key():
+    for silent, keys in ((PLAIN, True), (load_profile("npoint_lc400"), False)):
+        asked = session(None, profile=silent)
+        with pytest.raises(links.NoAnswerError) as caught:
+            asked.check_selftest()
+        assert ("link.reply_terminator" in str(caught.value)) == keys
+    for reply, line in ((b"OK\r\n", SCPI), (b"OK\r\n", LineFormat(b"\r"))):
+        with pytest.raises(links.CorruptError, match="reply_terminator"):
+            line.decode(reply)
+
+
 def test_an_echo_must_be_what_was_sent():
     link = PLAIN.link.model_copy(update={"echo": True})
     profile = PLAIN.model_copy(update={"link": link})
