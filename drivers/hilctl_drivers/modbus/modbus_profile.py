@@ -159,7 +159,7 @@ class ModbusInput(Channel):
     validity: Validity | Literal["none"] = Field(
         default="none",
         description="register that shows whether the reading is valid; an invalid reading is"
-        " recorded as missing. It is read together with the input if it is beside it",
+        " recorded as missing. It is read together with the input if it is beside it, or part of it",
     )
 
     @model_validator(mode="after")
@@ -311,18 +311,21 @@ class ModbusProfile(BaseProfile):
     def span(self, register: Register) -> tuple[int, int]:
         """Return wire address and number of the registers that are read for one.
 
-        A validity register beside an input is read with it.
+        A validity register is read with its input if it is beside it, or a part of it.
         """
         at = self.wire_address(register)
+        end = at + register.words
         validity = register.validity if isinstance(register, ModbusInput) else "none"
-        if validity == "none" or validity.read_function != register.read_function:
-            return at, register.words
-        there = self.wire_address(validity)
-        if at + register.words == there:
-            return at, register.words + validity.words
-        if there + validity.words == at:
-            return there, register.words + validity.words
-        return at, register.words
+        if validity != "none" and self.read_together(register, validity):
+            there = self.wire_address(validity)
+            at, end = min(at, there), max(end, there + validity.words)
+        return at, end - at
+
+    def read_together(self, one: Register, other: Register) -> bool:
+        """Return whether one request reads both registers: they touch or overlap."""
+        at, there = self.wire_address(one), self.wire_address(other)
+        near = at <= there + other.words and there <= at + one.words
+        return near and one.read_function == other.read_function
 
     def wire_address(self, register: Register) -> int:
         """Return the address that goes into the frame, 0 to 65535."""

@@ -140,7 +140,7 @@ def _rtu_missing(usual: int, received: Bytes) -> int:
 
 
 def read_request(profile: ModbusProfile, register: Register) -> bytes:
-    """Return the PDU that reads a register, and the validity of an input beside it."""
+    """Return the PDU that reads a register, and the validity of an input with it."""
     return modbus.read_pdu(register.read_function, *profile.span(register))
 
 
@@ -303,11 +303,12 @@ class ModbusSession:
         if validity == "none":
             return decode
         bits, valid = validity.bits, validity.valid
-        start, words = self.profile.span(source)
-        if words == source.words:
+        if not self.profile.read_together(source, validity):
             request = self.prepare(read_request(self.profile, validity))
             # Afterwards: a reading that has become invalid in between is not used.
             return lambda data: decode(data) if bits(request()) == valid else math.nan
+
+        start, _ = self.profile.span(source)
 
         def part(register: Register) -> slice:
             first = 2 * (self.profile.wire_address(register) - start)
@@ -389,7 +390,7 @@ def digital_time(profile: ModbusProfile, output: DigitalRegister) -> WireTime:
 def read_requests(profile: ModbusProfile, sensor: ModbusInput) -> list[bytes]:
     """Return the requests that read an input, and its validity if that is elsewhere."""
     requests, validity = [read_request(profile, sensor)], sensor.validity
-    if validity != "none" and profile.span(sensor)[1] == sensor.words:
+    if validity != "none" and not profile.read_together(sensor, validity):
         requests.append(read_request(profile, validity))
     return requests
 

@@ -339,11 +339,12 @@ FOREVER_NS = 2**62
 @pytest.mark.parametrize(("validity", "requests"), [
     ("{address: 4, type: uint16, mask: 0x3, valid: 0x1}", ["17000200030000000102"]),
     ("{address: 1, type: uint16, mask: 0x8}", ["17000100030000000102"]),
+    ("{address: 3, type: uint16, mask: 0x1}", ["17000200020000000102"]),
     ("{address: 9, type: uint16, mask: 0x3, valid: 0x1}", ["17000200020000000102", "0300090001"]),
     ("{area: discrete, address: 5, type: bit, mask: 1}", ["17000200020000000102", "0200050001"]),
 ])  # fmt: skip
 def test_invalid_reading_is_missing(driven, variant, validity, requests):
-    """A register beside the input is read with it."""
+    """A register beside the input is read with it, and so is one that is part of it."""
     output = (
         "OUT: {address: 0, type: float32, order: ABCD",
         "OUT: {address: 0, type: int16, scale: 0.001",
