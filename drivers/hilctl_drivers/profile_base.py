@@ -290,7 +290,9 @@ class BaseProfile(StrictModel):
     )
     notes: tuple[Text, ...] = Field(default=(), description="what to know before wiring")
     turnaround_s: float = Field(
-        ge=0.0, le=1.0, description="time from request to start of reply, s"
+        ge=0.0,
+        le=1.0,
+        description="time from request to start of reply, s; not for commands without a reply",
     )
     max_rate_hz: float = Field(gt=0.0, description="highest useful sample rate, Hz")
     link: LinkSettings

@@ -130,7 +130,11 @@ class TextLines(StreamSettings):
     checksum: Literal["none", "dcon", "gen"] = Field(
         default="none", description="dcon: two hex digits; gen: $ and two hex digits"
     )
-    min_gap_s: float = Field(default=0.0, ge=0.0, description="silence between commands, s")
+    min_gap_s: float = Field(
+        default=0.0,
+        ge=0.0,
+        description="silence between commands, s, such as the time to process one without a reply",
+    )
     max_line_chars: int | None = Field(
         default=None, ge=1, description="longest line that it accepts"
     )
@@ -440,7 +444,8 @@ class AsciiProfile(BaseProfile):
     outputs: dict[Name, AsciiOutput] = Field(description="outputs by name")
     inputs: dict[Name, AsciiInput] = Field(description="inputs by name")
     exchange: AsciiExchange | Literal["none"] = Field(
-        description="lines that write and read in one transaction; none if there are none"
+        description="lines that write and read in one transaction, unless another device or"
+        " another input reads the sensor; none if there are none"
     )
     digital_outputs: dict[Name, AsciiDigitalOutput] = Field(
         default={}, description="digital outputs by name, for pulses at marks of the waveform"
@@ -450,7 +455,9 @@ class AsciiProfile(BaseProfile):
     )
     errors: tuple[ErrorReply, ...] = Field(default=(), description="replies that report an error")
     error_query: Check | Literal["none"] = Field(
-        default="none", description="query whether an earlier command has left an error"
+        default="none",
+        description="query whether an earlier command has left an error; asked before the first"
+        " sample, after arming the watchdog and at the end, not with each sample",
     )
     init: tuple[AsciiStep, ...] = Field(
         default=(), description="steps after the device is identified"

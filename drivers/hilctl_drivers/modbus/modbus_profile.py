@@ -159,7 +159,7 @@ class ModbusInput(Channel):
     validity: Validity | Literal["none"] = Field(
         default="none",
         description="register that shows whether the reading is valid; an invalid reading is"
-        " recorded as missing. It is read together with the input if it is beside it, or part of it",
+        " recorded as missing. It is read with the input if it is beside it or part of it",
     )
 
     @model_validator(mode="after")

@@ -179,8 +179,12 @@ class Register(StrictModel):
 class Channel(Register, Range):
     """A register of an analogue input or output."""
 
-    raw_min: int | None = Field(default=None, description="lowest raw value in use")
-    raw_max: int | None = Field(default=None, description="highest raw value in use")
+    raw_min: int | None = Field(
+        default=None, description="lowest raw value in use, a bound of min and max"
+    )
+    raw_max: int | None = Field(
+        default=None, description="highest raw value in use, a bound of min and max"
+    )
     ignored_low_bits: int = Field(
         default=0, ge=0, le=15, description="low bits of the raw value that the device ignores"
     )
