@@ -1,10 +1,11 @@
 """Characterisation runner: one run per step, each planned from the steps before it."""
 
 import json
+import logging
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property
+from functools import cached_property, partial
 from pathlib import Path
 
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
@@ -42,6 +43,12 @@ from hilctl.studies.step_runner import (
     setting,
 )
 
+_log = logging.getLogger(__name__)
+
+
+class StallError(RunError):
+    """A stall of the computer, the line or the device ended a step."""
+
 
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
     """Return settings with a hold as waveform, without what belongs to the experiment's own one.
@@ -68,6 +75,8 @@ def _tracking_keys() -> Iterator[str]:
             yield key
 
 
+REPEATS = 2  # of a step that a stall ended
+_OF_STALLS = {"late", "device_lost"}  # codes of events
 _BYTES_PER_SAMPLE = 45.0
 _NAME_LENGTH = 80
 
@@ -197,9 +206,7 @@ class CharacterisationRunner:
             planned = {each.name: each.seconds for each in self.plan.steps}
             before = list(planned)[: list(planned).index(step.name)]
             self._runner.done_s = sum(planned[name] for name in before)
-            if self._host.run is not unpaced:  # without real time there is no coil
-                self._runner.cool(step.name, self._pause_s(heat))
-            recording = self._recorded(step, settings, path, planned[step.name])
+            recording = self._recorded(step, settings, path, planned[step.name], heat)
         now_s = self._host.now_s()
         # The coil has cooled since a kept run.
         self._coil.ran(heat, min(path.stat().st_mtime, now_s) if kept else now_s)
@@ -213,8 +220,32 @@ class CharacterisationRunner:
         self._host.on_step(self._rows[-1])
 
     def _recorded(
-        self, step: CharacterisationStep, settings: list[str], path: Path, seconds: float
+        self,
+        step: CharacterisationStep,
+        settings: list[str],
+        path: Path,
+        seconds: float,
+        heat: RunHeat,
     ) -> Recording:
+        """Run a step, again if a stall ended it; see :class:`StallError`."""
+        record = partial(self._recorded_once, step, settings, path, seconds, heat)
+        for number in range(1, REPEATS + 1):
+            try:
+                return record()
+            except StallError as error:
+                _log.warning("%s; the step is repeated (%d of %d)", error, number, REPEATS)
+        return record()
+
+    def _recorded_once(
+        self,
+        step: CharacterisationStep,
+        settings: list[str],
+        path: Path,
+        seconds: float,
+        heat: RunHeat,
+    ) -> Recording:
+        if self._host.run is not unpaced:  # without real time there is no coil
+            self._runner.cool(step.name, self._pause_s(heat))
         text = f"{step.name}: {step.purpose}"
         try:
             result = self._runner.run(
@@ -226,14 +257,30 @@ class CharacterisationRunner:
             raise RunError(f"{step.name} is refused: {error}") from None
         raise_if_stopped(step.name, result)
         if result.code != "completed":
-            raise _fault(step, result, read(path))
+            raise self._fault(step, result, read(path))
         recording = read(path)
         if (missing := _missing(recording)) > MOST_MISSING:
-            raise RunError(
+            raise StallError(
                 f"{step.name}: timing not kept: {100.0 * missing:.2g} % of the samples are "
                 f"missing, more than {100.0 * MOST_MISSING:g} %: {TIMING_REMEDY}"
             )
         return recording
+
+    def _fault(
+        self, step: CharacterisationStep, result: RunResult, recording: Recording
+    ) -> RunError:
+        """Return the problem of the rig behind a fault, or the fault itself."""
+        codes = {event.code for event in recording.events}
+        text = f"{step.name}: {result.reason}"
+        if "sensor_range" in codes:
+            return RigProblemError(
+                "saturated_sensor", text, "set a wider sensor range, or a narrower limits.stroke_um"
+            )
+        if "sensor_frozen" in codes:
+            return RigProblemError("no_reading", text, "check the sensor and its wiring")
+        # The next run reads the output, unless the device cannot tell it.
+        known = result.safe or self._loaded.config.safe.at_start is None
+        return StallError(text) if known and codes & _OF_STALLS else RunError(text)
 
     def _kept(self, path: Path, settings: list[str]) -> Recording | None:
         """Return the recording of a step that is done; otherwise None.
@@ -306,16 +353,3 @@ def _missing(recording: Recording) -> float:
     """Return the share of samples that are missing, because their ticks were skipped."""
     index = recording.samples.index
     return 1.0 - index.size / (int(index[-1]) + 1 - int(index[0]))
-
-
-def _fault(step: CharacterisationStep, result: RunResult, recording: Recording) -> RunError:
-    """Return the problem of the rig behind a fault, or the fault itself."""
-    codes = {event.code for event in recording.events}
-    text = f"{step.name}: {result.reason}"
-    if "sensor_range" in codes:
-        return RigProblemError(
-            "saturated_sensor", text, "set a wider sensor range, or a narrower limits.stroke_um"
-        )
-    if "sensor_frozen" in codes:
-        return RigProblemError("no_reading", text, "check the sensor and its wiring")
-    return RunError(text)
