@@ -44,14 +44,15 @@ class Found:
 
 
 def with_modes(
-    records: Sequence[Record], identify: Callable[[Sequence[FurtherMode]], Found]
+    records: Sequence[Record],
+    identify: Callable[[Sequence[FurtherMode], Selection | None], Found],
 ) -> Found:
     """Return a model with the further modes that its records show.
 
-    A missing mode distorts all other parameters, so the model is identified again with each mode
-    that is found, and its residual shows the modes more clearly.
+    A missing mode distorts all other parameters, so a model of the selected kind is identified
+    again with each mode that is found, and its residual shows the modes more clearly.
     """
-    best = identify(())
+    best = identify((), None)
     histories = [record for record in records if isinstance(record, History)]
     if not best.selection.settings.looks_for("modes") or len(histories) < len(records):
         return best
@@ -62,7 +63,7 @@ def with_modes(
         better = further_modes(histories, best.fit.modelled_um, known, first_hz)
         if better is None:
             break
-        tried = identify(better)
+        tried = identify(better, best.selection)
         if not tried.rms_percent < WORTH * best.rms_percent:
             break
         best = tried
@@ -118,9 +119,14 @@ def identify_records(request: FitRequest) -> Identification:
     """Fit a model to records, and evaluate it; raise DataError if they can't be used."""
     records, validate = request.records, request.validate
 
-    def found(modes: Sequence[FurtherMode]) -> Found:
+    def found(modes: Sequence[FurtherMode], selection: Selection | None) -> Found:
         asked = replace(request, modes=modes)
-        selection = select(asked)
+        if selection is None:
+            selection = select(asked)
+        elif selection.held_out:
+            start = selection.held_out.end
+            again = replace(asked, settings=selection.settings, start=start)
+            selection = replace(selection, held_out=held_out_error(again))
         held_out = selection.held_out
         chosen = replace(asked, settings=selection.settings)
         fit = fit_model(replace(chosen, start=held_out.end if held_out else None))

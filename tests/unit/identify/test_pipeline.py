@@ -147,7 +147,7 @@ class Found:
 def identifying(*found):
     """Return what finds models one after the other, with the modes that it was given."""
     left = iter(found)
-    return lambda modes: replace(next(left), modes=tuple(modes))
+    return lambda modes, selection: replace(next(left), modes=tuple(modes))
 
 
 @pytest.fixture
