@@ -180,7 +180,7 @@ def test_drivers_that_are_not_there_are_said(monkeypatch, place):
 def test_a_device_is_described_by_its_options():
     options = {option.name: option for option in describe("modbus_dac").options}
     assert options["profile"].default is None
-    assert options["timeout_s"].default == "0.1"
+    assert options["timeout_s"].default == ""
     assert options["host"].default == ""
     assert "longest wait" in options["timeout_s"].description
 
