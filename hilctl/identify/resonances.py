@@ -31,6 +31,7 @@ FOLLOWED = 3  # starts that are optimised
 APART = 1.4  # minimum frequency ratio to the first mode, whose own error would be nearer
 DISTINCT = 1.15  # minimum frequency ratio of two further modes
 LEAST_DAMPING, MOST_DAMPING = 2e-3, 0.3
+AT_BOUND = 0.98  # of the largest damping: a mode that has it is no resonance
 NEAR = math.log(2.0)  # maximum of antiresonance over resonance
 SMOOTH = 3  # parameters of the smooth part: gain, slope, bend
 MOST = 3
@@ -252,10 +253,13 @@ def _response(x: F64, frequency_hz: F64) -> C128:
 
 
 def _stands(modes: Sequence[FurtherMode], first_hz: float | None, rate_hz: float) -> bool:
-    """Return whether modes are distinct and have an inverse."""
+    """Return whether modes are distinct resonances and have an inverse."""
     ends = [hz for mode in modes for hz in (mode.natural_hz, mode.antiresonance_hz)]
     ladder = sorted(mode.natural_hz for mode in modes)
     if not all(_apart(hz, first_hz) for hz in ends):
+        return False
+    dampings = [z for mode in modes for z in (mode.damping_ratio, mode.antiresonance_damping_ratio)]
+    if max(dampings) > AT_BOUND * MOST_DAMPING:
         return False
     if any(after < DISTINCT * before for before, after in pairwise(ladder)):
         return False
