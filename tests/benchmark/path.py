@@ -5,6 +5,7 @@ Run it with ``python -m tests.benchmark.path``; see README.md beside it. Only ad
 
 import argparse
 import json
+import math
 import subprocess
 import tempfile
 from collections.abc import Iterator, Sequence
@@ -13,6 +14,8 @@ from contextlib import contextmanager
 from pathlib import Path
 from typing import Any
 
+from hilctl.analysis.report import summarize
+from hilctl.recording.reader import read
 from tests.commands import typed
 
 CASES = {
@@ -40,7 +43,8 @@ CASES = {
     "bk_precision_1785b A": ("bk_precision_1785b", "--reader", "capancdt_6200"),
 }
 """Words of ``hilctl init`` by the name of the case."""
-RESUMES = 12  # of a command whose step was ended by the machine
+RESUMES = 12  # of a command whose step a stall of the machine ended
+EMULATOR = ("chrt", "--fifo", "10")
 
 
 class PathError(Exception):
@@ -59,55 +63,59 @@ def emulated(experiment: Path) -> Iterator[list[str]]:
             process.terminate()
 
 
-EMULATOR = ("chrt", "--fifo", "10")
+def answer(name: str, folder: Path, command: str, *words: str) -> Any:
+    """Run a command and return its JSON; raise PathError if it fails."""
+    for _ in range(1 + RESUMES):
+        done = subprocess.run(
+            typed(command, *words, "--json"), capture_output=True, text=True, cwd=folder
+        )
+        if done.returncode == 0:
+            print(f"{name}: {command}", flush=True)
+            return json.loads(done.stdout)
+        print(f"{name}: {command}: {done.stderr[-400:]}", flush=True)
+        if "resumes" not in done.stderr:
+            break
+    raise PathError(command)
 
 
-def follow(name: str, words: Sequence[str], folder: Path) -> dict[str, Any]:
-    """Return the answer of each command, or the end of its error text under ``failed``."""
-    folder.mkdir(parents=True, exist_ok=True)
-    answers: dict[str, Any] = {}
-
-    def said(command: str, *more: str) -> Any:
-        command_line = typed(command, *more, "--json")
-        for again in range(1 + RESUMES):
-            done = subprocess.run(command_line, capture_output=True, text=True, cwd=folder)
-            if done.returncode == 0:
-                print(f"{name}: {command}", f"({again} resumes)" * (again > 0), flush=True)
-                answers[command] = json.loads(done.stdout)
-                return answers[command]
-            print(f"{name}: {command}: {done.stderr[-400:]}", flush=True)
-            if "resumes" not in done.stderr:
-                break
-        raise PathError(f"{command}: {done.stderr[-400:]}")
-
+def follow(name: str, words: Sequence[str], folder: Path) -> str:
+    """Return the row of a case: errors in percent, and those expected from noise in brackets."""
+    folder.mkdir(parents=True)
+    row = f"{name:24}"
     try:
-        said("init", *words, "--output", "rig.yaml")
+        answer(name, folder, "init", *words, "--output", "rig.yaml")
         with emulated(folder / "rig.yaml") as at:
-            said("check", "rig.yaml", *at)
-            found = said("characterise", "rig.yaml", *at, "--output", "model.yaml")
+            answer(name, folder, "check", "rig.yaml", *at)
+            found = answer(name, folder, "characterise", "rig.yaml", *at, "--output", "model.yaml")
+            for each in found["held_out"]:
+                row += f" {each['peak_percent']:.2f}"
+            row += f" ({found['held_out'][0]['floor_percent']:.3f}) |"
             run = [*at, *(f"--set={each}" for each in found["first_run"])]
-            said("run", "rig.yaml", *run, "--output", "run.mcap")
-            said("learn", "rig.yaml", *run, "--output", "learned.yaml")
+            answer(name, folder, "run", "rig.yaml", *run, "--output", "run.mcap")
+            first = summarize(read(folder / "run.mcap")).peak_error_percent
+            row += f" {math.nan if first is None else first:.2f} |"
+            learned = answer(name, folder, "learn", "rig.yaml", *run, "--output", "learned.yaml")
+            for waveform in learned["waveforms"]:
+                row += f" {waveform['start_percent']:.2f} -> {waveform['error_percent']:.3f}"
     except PathError as error:
-        answers["failed"] = str(error)
-    return answers
+        row += f" failed: {error}"
+    print(row, flush=True)
+    return row
 
 
 def main() -> int:
-    """Follow the path with all devices and print the errors."""
+    """Follow the path with all cases, and print held-out errors, first run, and learning."""
     parser = argparse.ArgumentParser(description=main.__doc__)
     parser.add_argument("--cases", nargs="+", choices=CASES, default=list(CASES))
     parser.add_argument("--jobs", type=int, default=3, help="devices at a time")
-    parser.add_argument("--folder", type=Path, default=None)
+    parser.add_argument("--folder", type=Path, help="keep the files here, in a new folder")
     given = parser.parse_args()
     folder = given.folder or Path(tempfile.mkdtemp())
+    places = [folder / each.replace(" ", "_") for each in given.cases]
     with ThreadPoolExecutor(given.jobs) as pool:
-        places = [folder / each.replace(" ", "_").replace(",", "") for each in given.cases]
-        words = [CASES[each] for each in given.cases]
-        results = list(pool.map(follow, given.cases, words, places))
-    for name, answers in zip(given.cases, results, strict=True):
-        print(name, json.dumps({key: answers[key] for key in answers if key == "failed"}))
-    return int(any("failed" in each for each in results))
+        rows = list(pool.map(follow, given.cases, map(CASES.__getitem__, given.cases), places))
+    print("\n" + "\n".join(rows))
+    return int(any("failed" in row for row in rows))
 
 
 if __name__ == "__main__":
