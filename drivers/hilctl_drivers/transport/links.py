@@ -31,7 +31,7 @@ ECHOED = (
     "the request came back before the reply: the adapter echoes, or receives what it sends; "
     "set echo: true beside the address"
 )
-"""What is wrong if a whole request is received where its reply is due."""
+"""Message for a request that is received in place of its reply."""
 
 
 class NoAnswerError(DeviceError):

@@ -2,7 +2,7 @@
 
 import json
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -206,7 +206,8 @@ class CharacterisationRunner:
             planned = {each.name: each.seconds for each in self.plan.steps}
             before = list(planned)[: list(planned).index(step.name)]
             self._runner.done_s = sum(planned[name] for name in before)
-            recording = self._recorded(step, settings, path, planned[step.name], heat)
+            planned_s = planned[step.name]
+            recording = _repeated(partial(self._recorded, step, settings, path, planned_s, heat))
         now_s = self._host.now_s()
         # The coil has cooled since a kept run.
         self._coil.ran(heat, min(path.stat().st_mtime, now_s) if kept else now_s)
@@ -220,23 +221,6 @@ class CharacterisationRunner:
         self._host.on_step(self._rows[-1])
 
     def _recorded(
-        self,
-        step: CharacterisationStep,
-        settings: list[str],
-        path: Path,
-        seconds: float,
-        heat: RunHeat,
-    ) -> Recording:
-        """Run a step, again if a stall ended it; see :class:`StallError`."""
-        record = partial(self._recorded_once, step, settings, path, seconds, heat)
-        for number in range(1, REPEATS + 1):
-            try:
-                return record()
-            except StallError as error:
-                _log.warning("%s; the step is repeated (%d of %d)", error, number, REPEATS)
-        return record()
-
-    def _recorded_once(
         self,
         step: CharacterisationStep,
         settings: list[str],
@@ -347,6 +331,16 @@ class CharacterisationRunner:
             settings.append(f"safe.at_start={self.limits.rest!r}")  # where the previous step ended
         # Noise common to all steps would be fitted.
         return settings + self._loaded.noise_settings(number)
+
+
+def _repeated(record: Callable[[], Recording]) -> Recording:
+    """Return the recording of a step, which is run again if a stall ends it."""
+    for number in range(1, REPEATS + 1):
+        try:
+            return record()
+        except StallError as error:
+            _log.warning("%s; the step is repeated (%d of %d)", error, number, REPEATS)
+    return record()
 
 
 def _missing(recording: Recording) -> float:
