@@ -46,9 +46,12 @@ Bank: TypeAlias = tuple[F64, F64, F64, F64, F64]
 p (n + 1)], weights of the drags in c cells, float64[d c], and the grid, float64[7]: lowest edge,
 width and n for the plays, width and c for the drags; k and a T / k of the creep of the plays."""
 Span: TypeAlias = tuple[float, float, float]
-Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float, float]
-"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, g, e_0, and the part that z
-before a sample has in its mean over the sample; the rest is h's."""
+Losses: TypeAlias = tuple[
+    float, float, float, float, float, float, float, float, float, float
+]
+"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, g, e_0, the part that z
+before a sample has in its mean over the sample, of which the rest is h's; and the part that w after
+a sample has in its mean over the sample, of which the rest is that of w before."""
 
 _BEFORE_POLE = 0.9
 _STEPS = 100
@@ -362,7 +365,7 @@ def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -
 
     ``v`` is the command after a part, ``late``, at least half, of the step that ends at each
     sample, which takes ``step_s``; ``w`` is filled, the first with the first command: float64[n]
-    each. The first three of ``losses`` are in s, the third tau_b itself, and the last is not used.
+    each. The first three of ``losses`` are in s, the third tau_b itself, and the last two are not used.
     """
     w[0] = v[0]
     z = change = before = 0.0
@@ -394,9 +397,10 @@ def _given(
     k = memory.size - 6
     e = losses[0] * (w - memory[k + 3]) + losses[1] * (m - memory[k + 1])
     lost, lost_slope = lost_field(e, losses)
-    command = 0.5 * (w + memory[k + 3]) + losses[8] * memory[k + 2] + (1.0 - losses[8]) * lost
+    mean = memory[k + 3] + losses[9] * (w - memory[k + 3])
+    command = mean + losses[8] * memory[k + 2] + (1.0 - losses[8]) * lost
     e_slope = losses[0] * w_slope + losses[1] * slope
-    command_slope = 0.5 * w_slope + (1.0 - losses[8]) * lost_slope * e_slope
+    command_slope = losses[9] * w_slope + (1.0 - losses[8]) * lost_slope * e_slope
     value = m if what == _OUTPUT else (w if what == _FIELD else command)
     by_u = slope if what == _OUTPUT else (w_slope if what == _FIELD else command_slope)
     return value, by_u, m
@@ -462,7 +466,8 @@ def _advance(
     if fresh:
         memory[k + 3], e = w, 0.0
     lost = lost_field(e, losses)[0]
-    command = 0.5 * (w + memory[k + 3]) + losses[8] * memory[k + 2] + (1.0 - losses[8]) * lost
+    mean = memory[k + 3] + losses[9] * (w - memory[k + 3])
+    command = mean + losses[8] * memory[k + 2] + (1.0 - losses[8]) * lost
     memory[k + 2] = losses[2] * memory[k + 2] + (1.0 - losses[2]) * lost
     before = memory[k]
     _settle(u, memory, bank)

@@ -185,8 +185,9 @@ def _moved(y: float, memory: F64, band: Band, losses: Losses) -> tuple[float, fl
     z = losses[2] * memory[2] + (1.0 - losses[2]) * lost
     i = _cell((y - grid[0]) / grid[1], lines.shape[1] - 1.0)
     e_by_y = losses[0] * by_y + losses[1] * (lines[1, i + 1] - lines[1, i]) / grid[1]
-    command = 0.5 * (w + memory[1]) + losses[8] * memory[2] + (1.0 - losses[8]) * lost
-    return w, z, command, 0.5 * by_y + (1.0 - losses[8]) * steeper * e_by_y
+    mean = memory[1] + losses[9] * (w - memory[1])
+    command = mean + losses[8] * memory[2] + (1.0 - losses[8]) * lost
+    return w, z, command, losses[9] * by_y + (1.0 - losses[8]) * steeper * e_by_y
 
 
 @kernel()

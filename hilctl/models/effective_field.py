@@ -7,12 +7,14 @@ from typing import Annotated, Any, Literal
 import numpy as np
 
 from hilctl.base.strict import CheckedModel, Field, StrictModel
+from hilctl.base.types import F64
 from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights
 from hilctl.models.implicit_models import cell_problems, line_problems, play_tables, table_problems
 
 _TOLERANCE_UM = 1e-6
 _EVEN = 1e-3
+_SHORTEST, _LONGEST = 1e-12, 1e3  # per time that passes; others differ in no digit, or little
 
 Time = Annotated[float, Field(ge=0.0, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -21,6 +23,18 @@ NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
 def even_excess(span: float) -> float:
     """Return e_0, below which the excess loss is linear, for a span of effective fields."""
     return _EVEN * span
+
+
+def part_in_mean(lags: F64, decays: F64) -> F64:
+    """Return the part of its end in a field's mean while it follows a held command: float64[n].
+
+    ``lags`` and ``decays`` are the lag of slow changes and the delay of the losses, per the time:
+    float64[n]. The part is 1 for a field that arrives, a half of one that is slow. Of losses with a
+    delay only those count that a change has within the time.
+    """
+    decays = np.maximum(decays, _SHORTEST)
+    within = np.clip(lags * (1.0 + decays * np.expm1(-1.0 / decays)), _SHORTEST, _LONGEST)
+    return np.asarray(-1.0 / np.expm1(-1.0 / within) - within)
 
 
 class FieldLosses(StrictModel):
@@ -49,12 +63,17 @@ class FieldLosses(StrictModel):
     excess: NotNegative = 0.0
     self_growth: NotNegative = 0.0
 
-    def sampled(self, sample_rate_hz: float, span: float) -> Losses:
-        """Return the losses in the form of the kernels, for a span of effective fields.
+    def sampled(self, sample_rate_hz: float, span: float, slope: float) -> Losses:
+        """Return the losses in the form of the kernels.
 
-        Commands are means over a sample, so losses must be means, too.
+        A command is held, so field and losses count as means over a sample.
+
+        Args:
+            span: Of effective fields.
+            slope: Mean slope of the operators, um per command unit.
         """
         lags = self.decay_s * sample_rate_hz
+        lag_s = self.field_s + self.output_s * slope
         left = math.exp(-1.0 / lags) if lags > 0.0 else 0.0
         return (
             self.field_s * sample_rate_hz,
@@ -66,6 +85,7 @@ class FieldLosses(StrictModel):
             self.self_growth,
             even_excess(span),
             (1.0 - left) * lags,
+            float(part_in_mean(np.array(lag_s * sample_rate_hz), np.array(lags))),
         )
 
 
@@ -177,7 +197,8 @@ class FieldModel(HysteresisModel):
     def _parameters(self, sample_rate_hz: float) -> tuple[Any, ...]:
         width = self.cell * len(self.slopes[0])
         span = self.lowest - width, self.lowest + 2.0 * width, _TOLERANCE_UM
-        losses = self.losses.sampled(sample_rate_hz, width)
+        slope = sum(float(np.mean(line)) for line in self.slopes)
+        losses = self.losses.sampled(sample_rate_hz, width, slope)
         curve = np.array(self.curve.operators_um), np.array(self.curve.displacement_um)
         return span, self._bank(sample_rate_hz), self.coupling, losses, curve
 

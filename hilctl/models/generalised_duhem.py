@@ -93,7 +93,9 @@ class GeneralisedDuhemModel(HysteresisModel):
         return band_of(slopes, lines, self.lowest_um, self.cell_um, self.half_width)
 
     def _losses(self, sample_rate_hz: float) -> Losses:
-        return self.losses.sampled(sample_rate_hz, self.centre[-1] - self.centre[0])
+        span = self.centre[-1] - self.centre[0]
+        slope = (self.flux[-1] - self.flux[0]) / span
+        return self.losses.sampled(sample_rate_hz, span, slope)
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""

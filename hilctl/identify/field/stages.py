@@ -173,8 +173,8 @@ def signals(run: Run, known: Physical, curve: Curve | None, span: float) -> tupl
     # The excess loss is linear below a part of the span. Without a curve, y is its output.
     y = run.bare_um(known.delay_s, 2.0 * known.damping_ratio * known.radian_s, known.radian_s**2)
     m = y if curve is None else curve.operators_of(y)
-    losses: Any = (*known.losses.model_dump().values(), even_excess(span), 0.0)
+    losses: Any = (*known.losses.model_dump().values(), even_excess(span), 0.0, 0.0)
     w = np.empty_like(y)
-    late, command = run.late_command(max(known.lag_s, SHORTEST_S))
+    late, command = run.late_command(known.lag_s, known.losses.decay_s)
     field_left(command, late, run.step_s, m, losses, w)
     return w, y

@@ -33,8 +33,8 @@ BANK = (
 CREEP, PACE = 0.3, 0.5
 CREEPING = (*BANK[:-1], np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS, CREEP, PACE]))
 SPAN = (-12.0, 12.0, 1e-10)
-LOSSES = (3.0, 0.4, 0.6, 0.1, 0.02, 0.05, 0.2, 0.01, -0.4 / math.log(0.6))
-NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
+LOSSES = (3.0, 0.4, 0.6, 0.1, 0.02, 0.05, 0.2, 0.01, -0.4 / math.log(0.6), 0.55)
+NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0)
 CURVE = (np.array([-50.0, 0.0, 50.0]), np.array([-40.0, 0.0, 60.0]))
 SAME = (np.array([0.0, 1.0]), np.array([0.0, 1.0]))
 LINE = (  # one play without a threshold, of slope 2
@@ -85,7 +85,7 @@ def operators(u):
 
 
 def h(e, losses):
-    _, _, _, b, c, x, g, e_0, _ = losses
+    _, _, _, b, c, x, g, e_0, *_ = losses
     size = abs(e)
     near = min(g * size, 0.9)
     grown = size if g == 0.0 else (near / (1.0 - near) + (g * size - near) / (1.0 - near) ** 2) / g
@@ -100,7 +100,7 @@ def commands(w, m, losses):
         e = losses[0] * (w[k] - w[k - 1]) + losses[1] * (m[k] - m[k - 1])
         mean = losses[8] * z + (1.0 - losses[8]) * h(e, losses)
         z = losses[2] * z + (1.0 - losses[2]) * h(e, losses)
-        out.append(0.5 * (w[k] + w[k - 1]) + mean)
+        out.append(w[k - 1] + losses[9] * (w[k] - w[k - 1]) + mean)
     return np.array(out)
 
 
@@ -238,7 +238,7 @@ def test_a_line_through_points_goes_on_straight():
 
 
 def test_lost_field_by_hand():
-    losses = (0.0, 0.0, 0.0, 0.1, 0.02, 0.5, 0.3, 0.25, 0.0)
+    losses = (0.0, 0.0, 0.0, 0.1, 0.02, 0.5, 0.3, 0.25, 0.0, 0.5)
     assert lost_field(2.0, losses)[0] == pytest.approx(2.0 * (2.5 + 0.2 + 0.08 + 0.5 / 1.5))
     assert lost_field(-2.0, losses) == (-lost_field(2.0, losses)[0], lost_field(2.0, losses)[1])
 
@@ -246,7 +246,7 @@ def test_lost_field_by_hand():
 @pytest.mark.parametrize("only", [3, 4, 5, 6])
 @pytest.mark.parametrize("e", [-3.0, -0.2, 0.0, 0.01, 0.4, 5.0])
 def test_the_slope_of_the_losses_is_their_derivative(only, e):
-    losses = (*(0.7 if i == only else 0.0 for i in range(7)), 0.25, 0.0)
+    losses = (*(0.7 if i == only else 0.0 for i in range(7)), 0.25, 0.0, 0.5)
     rise = lost_field(e + 1e-5, losses)[0] - lost_field(e - 1e-5, losses)[0]
     assert lost_field(e, losses)[1] == pytest.approx(rise / 2e-5, rel=1e-4)
 
@@ -254,8 +254,8 @@ def test_the_slope_of_the_losses_is_their_derivative(only, e):
 @pytest.mark.parametrize("step_s", [1.0, 2e-5])
 def test_the_field_left_is_the_one_that_the_losses_were_added_to(step_s):
     w, m = path(), 5.0 * np.cos(np.arange(500) / 9.0)
-    left, half, steps_s = np.empty_like(w), np.full(w.size, 0.5), np.full(w.size, step_s)
+    left, late, steps_s = np.empty_like(w), np.full(w.size, LOSSES[9]), np.full(w.size, step_s)
     field_s, output_s = step_s * LOSSES[0], step_s * LOSSES[1]
     losses = (field_s, output_s, -step_s / math.log(LOSSES[2]), *LOSSES[3:])
-    field_left(commands(w, m, LOSSES), half, steps_s, m, losses, left)
+    field_left(commands(w, m, LOSSES), late, steps_s, m, losses, left)
     np.testing.assert_allclose(left, w, atol=1e-4 * np.abs(np.diff(w)).max())

@@ -19,8 +19,8 @@ SLOPES = np.stack(
         for way in (1.0, -1.0)
     ]
 )
-NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0)
-LOSSES = (3.0, 0.02, 0.6, 0.1, 0.02, 0.05, 0.05, 0.01, 0.75)
+NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0)
+LOSSES = (3.0, 0.02, 0.6, 0.1, 0.02, 0.05, 0.05, 0.01, 0.75, 0.55)
 
 
 def band(slopes=SLOPES, step=math.inf):
@@ -105,7 +105,7 @@ def test_the_command_is_ahead_by_the_losses():
     ends = np.concatenate(([NODES[0] - 50.0], NODES, [NODES[-1] + 50.0]))
     last = (FLUX[-1] - FLUX[-2]) / (NODES[-1] - NODES[-2])
     flux = np.interp(y, ends, np.concatenate(([0.0], FLUX, [FLUX[-1] + 50.0 * last])))
-    field_pace, output_pace, left, growth, bend, excess, self_growth, even, mean = LOSSES
+    field_pace, output_pace, left, growth, bend, excess, self_growth, even, mean, late = LOSSES
     z, expected = 0.0, [w[0]]
     for k in range(1, y.size):
         e = field_pace * (w[k] - w[k - 1]) + output_pace * (flux[k] - flux[k - 1])
@@ -113,7 +113,7 @@ def test_the_command_is_ahead_by_the_losses():
         assert self_growth * size < 0.9
         lost = growth * size + bend * size**2 + excess / math.sqrt(size + even)
         lost = e * (1.0 / (1.0 - self_growth * size) + lost)
-        expected.append(0.5 * (w[k] + w[k - 1]) + mean * z + (1.0 - mean) * lost)
+        expected.append(w[k - 1] + LOSSES[9] * (w[k] - w[k - 1]) + mean * z + (1.0 - mean) * lost)
         z = left * z + (1.0 - left) * lost
     assert run(duhem_inverse, y, LOSSES) == pytest.approx(expected, abs=1e-9)
 
@@ -122,8 +122,7 @@ def test_columns_are_how_the_field_changes_with_the_logarithms():
     y, rows = path()[:300], np.arange(0, 300, 7)
     columns, w = np.empty((rows.size, SLOPES.size)), np.empty_like(y)
     duhem_columns(y, 0.0, 0.0, band(step=1.0), rows, w, columns)
-    means = np.append(w[0], 0.5 * (w[1:] + w[:-1]))
-    assert run(duhem_inverse, y, NO_LOSSES, band(step=1.0)) == pytest.approx(means, abs=1e-12)
+    assert run(duhem_inverse, y, NO_LOSSES, band(step=1.0)) == pytest.approx(w, abs=1e-12)
     largest = np.abs(columns).max(axis=0)
     for node in np.argsort(largest)[-20::4]:
         slopes = np.log(SLOPES)

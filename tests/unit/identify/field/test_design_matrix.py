@@ -30,13 +30,7 @@ def test_columns_times_slopes_are_the_model():
         thresholds=tuple(GRID.thresholds), lengths=tuple(GRID.lengths), lowest=GRID.lowest,
         cell=GRID.piece / FINER, slopes=tuple(map(tuple, slopes)), curve=line,
     )  # fmt: skip
-    # Without losses the field is the mean of the command over a sample: so feed what gives u.
-    command = np.empty_like(u)
-    before = u[0]
-    for k, now in enumerate(u):
-        command[k] = 0.5 * (now + before)
-        before = now
-    modelled = model.forward(1.0).process(command)
+    modelled = model.forward(1.0).process(u)
     rows = np.arange(u.size)
     columns = table([u], [rows], GRID)
     given = columns @ SLOPES.ravel()

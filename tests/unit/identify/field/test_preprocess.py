@@ -69,14 +69,17 @@ def test_commands_of_long_steps_are_those_near_their_ends():
 
 
 @pytest.mark.parametrize("lag_s", [1e-5, 3e-4, 1e-3])
-def test_a_lag_is_exact_over_steps_of_any_length(lag_s):
-    step_s = np.array([0.0, 1e-5, 4e-4, 1e-2])
-    ramp = np.zeros((3, 4))
-    run = Run(RATE_HZ, np.arange(4), step_s, 2.0 * step_s, step_s, ramp, 0)
+@pytest.mark.parametrize("samples", [1, 4, 100])
+def test_a_lag_is_exact_over_steps_of_any_length(lag_s, samples):
+    """A first-order lag from 0 behind commands that are held: 3, 5, 7 and so on."""
+    left, field = math.exp(-1.0 / (lag_s * RATE_HZ)), 0.0
+    for k in range(samples):
+        field = left * field + (1.0 - left) * (3.0 + 2.0 * k)
+    step_s, mean = np.array([samples / RATE_HZ]), np.array([2.0 + samples])
+    motion = np.zeros((3, 1))
+    run = Run(RATE_HZ, np.arange(1), step_s, mean + samples, mean, motion, 0)
     late, command = run.late_command(lag_s)
-    change = command / (late + lag_s / np.maximum(step_s, 1e-12))
-    gone = lag_s * -np.expm1(-step_s / lag_s)
-    assert change[1:] == pytest.approx((2.0 * (step_s - gone))[1:], rel=1e-3)
+    assert command / (late + lag_s / step_s) == pytest.approx(field)
 
 
 @pytest.mark.parametrize("frequency_hz", [1.0, 20.0])

@@ -127,7 +127,7 @@ def test_of_a_model_s_record_the_field_is_the_model_s(decay_s):
     )  # fmt: skip
     y_um = model.forward(RATE_HZ).process(COMMAND)
     run = plain_run(COMMAND, np.stack([y_um, np.zeros_like(y_um), np.zeros_like(y_um)]))
-    known = stages.Physical(losses, 1e-4, 0.3, 0.0, 1.0)
+    known = stages.Physical(losses, 1e-4, 0.3, 0.0, lag_s=2e-4 + 3e-5 * 2.0)
     u, bare_um = stages.signals(run, known, Curve(operators, displacement_um), 20.0)
     np.testing.assert_array_equal(bare_um, y_um)
     np.testing.assert_allclose(2.0 * u, np.interp(y_um, displacement_um, operators), atol=1e-4)
