@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hilctl import __version__
-from hilctl.base.errors import ConfigError, HilctlError, RunError
+from hilctl.base.errors import ConfigError, HilctlError
 from hilctl.base.files import make_folder
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.segments import Segment
@@ -29,6 +29,7 @@ from hilctl.ilc.update import IlcState, learn, refused
 from hilctl.models.model_file import model_sha256
 from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
+from hilctl.run.stalls import fault_of, repeated
 from hilctl.run.start import StepStoppedError, checked_experiment, paced
 
 HIGHEST_PART = 0.125
@@ -237,11 +238,17 @@ class IlcSession:
         write_correction(file, self._whole(cycles), overwrite=True)
         noise = self._checked.loaded.noise_settings(number)  # which must not be learned
         settings = [*self._settings, correction_setting(file), *noise]
-        result = self._run(self._experiment, settings, self._folder / f"{name}.mcap")
+        path = self._folder / f"{name}.mcap"
+        return repeated(lambda: self._completed(f"run {number}", settings, path))
+
+    def _completed(self, name: str, settings: Sequence[str], path: Path) -> Path:
+        result = self._run(self._experiment, settings, path)
+        text = f"{name}: {result.reason}"
         if result.stop_signal and self._rows:
-            raise StepStoppedError(f"run {number}: {result.reason}", result.stop_signal)
+            raise StepStoppedError(text, result.stop_signal)
         if result.code != "completed":
-            raise RunError(f"run {number}: {result.reason}")
+            at_start = self._checked.loaded.config.safe.at_start
+            raise fault_of(text, result, read(result.path), at_start)
         return result.path
 
     def _judge(self, number: int, path: Path, *, learning: bool) -> list[IlcRow]:

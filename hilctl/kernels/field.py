@@ -46,9 +46,7 @@ Bank: TypeAlias = tuple[F64, F64, F64, F64, F64]
 p (n + 1)], weights of the drags in c cells, float64[d c], and the grid, float64[7]: lowest edge,
 width and n for the plays, width and c for the drags; k and a T / k of the creep of the plays."""
 Span: TypeAlias = tuple[float, float, float]
-Losses: TypeAlias = tuple[
-    float, float, float, float, float, float, float, float, float, float
-]
+Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
 """tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, g, e_0, the part that z
 before a sample has in its mean over the sample, of which the rest is h's; and the part that w after
 a sample has in its mean over the sample, of which the rest is that of w before."""
@@ -365,7 +363,8 @@ def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -
 
     ``v`` is the command after a part, ``late``, at least half, of the step that ends at each
     sample, which takes ``step_s``; ``w`` is filled, the first with the first command: float64[n]
-    each. The first three of ``losses`` are in s, the third tau_b itself, and the last two are not used.
+    each. The first three of ``losses`` are in s, the third tau_b itself, and the last two are not
+    used.
     """
     w[0] = v[0]
     z = change = before = 0.0

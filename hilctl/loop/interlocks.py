@@ -21,7 +21,14 @@ from hilctl.kernels.jit import compiled
 from hilctl.loop.block import Block
 
 TripCode: TypeAlias = Literal[
-    "stroke", "sensor_range", "sensor_frozen", "deviation", "thermal", "tracking_error", "aux"
+    "stroke",
+    "sensor_invalid",
+    "sensor_range",
+    "sensor_frozen",
+    "deviation",
+    "thermal",
+    "tracking_error",
+    "aux",
 ]
 
 _FIRST_SAMPLE = int(BlockHeader.FIRST_SAMPLE)
@@ -301,7 +308,7 @@ class Interlocks:
         if math.isnan(displacement_um):
             since = for_longer_than(self.settings.sensor_invalid_s)
             text = f"displacement at sample {sample} is no valid reading{since}"
-            return Trip(sample, "stroke", text)
+            return Trip(sample, "sensor_invalid", text)
         reading = f"displacement {displacement_um:.4g} µm at sample {sample}"
         low, high = self.context.sensor_um
         if math.isfinite(displacement_um) and not low < displacement_um < high:

@@ -66,11 +66,8 @@ class FieldLosses(StrictModel):
     def sampled(self, sample_rate_hz: float, span: float, slope: float) -> Losses:
         """Return the losses in the form of the kernels.
 
-        A command is held, so field and losses count as means over a sample.
-
-        Args:
-            span: Of effective fields.
-            slope: Mean slope of the operators, um per command unit.
+        A command is held, so field and losses count as means over a sample. ``span`` is that of the
+        effective fields, ``slope`` the mean slope of the operators in um per command unit.
         """
         lags = self.decay_s * sample_rate_hz
         lag_s = self.field_s + self.output_s * slope

@@ -105,7 +105,7 @@ def test_bad_sensor_ramps_down(tmp_path, kind, words):
     first = int(np.argmax((recording.samples.flags & Flag.SENSOR_INVALID.value) != 0))
     assert first >= 9000
     trip = recording.events[0]
-    assert (trip.code, trip.sample, trip.level) == ("stroke", first, "error")
+    assert (trip.code, trip.sample, trip.level) == ("sensor_invalid", first, "error")
     assert trip.before.index.tolist() == list(range(first - 49, first + 1))
     part = recording.samples.part(first - 49, first + 1)
     assert np.array_equal(trip.before.command, part.command)

@@ -1,8 +1,7 @@
 """Characterisation runner: one run per step, each planned from the steps before it."""
 
 import json
-import logging
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
 from functools import cached_property, partial
@@ -22,6 +21,7 @@ from hilctl.models.model_file import dump_model
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.run.result import RunResult
+from hilctl.run.stalls import StallError, fault_of, repeated
 from hilctl.run.start import RunKey, checked_experiment, unpaced
 from hilctl.studies.characterise.limits import CharacterisationLimits, limits_of
 from hilctl.studies.characterise.measurements import RigProblemError
@@ -42,12 +42,6 @@ from hilctl.studies.step_runner import (
     require_room,
     setting,
 )
-
-_log = logging.getLogger(__name__)
-
-
-class StallError(RunError):
-    """A stall of the computer, the line or the device ended a step."""
 
 
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
@@ -75,8 +69,6 @@ def _tracking_keys() -> Iterator[str]:
             yield key
 
 
-REPEATS = 2  # of a step that a stall ended
-_OF_STALLS = {"late", "device_lost"}  # codes of events
 _BYTES_PER_SAMPLE = 45.0
 _NAME_LENGTH = 80
 
@@ -207,7 +199,7 @@ class CharacterisationRunner:
             before = list(planned)[: list(planned).index(step.name)]
             self._runner.done_s = sum(planned[name] for name in before)
             planned_s = planned[step.name]
-            recording = _repeated(partial(self._recorded, step, settings, path, planned_s, heat))
+            recording = repeated(partial(self._recorded, step, settings, path, planned_s, heat))
         now_s = self._host.now_s()
         # The coil has cooled since a kept run.
         self._coil.ran(heat, min(path.stat().st_mtime, now_s) if kept else now_s)
@@ -262,9 +254,7 @@ class CharacterisationRunner:
             )
         if "sensor_frozen" in codes:
             return RigProblemError("no_reading", text, "check the sensor and its wiring")
-        # The next run reads the output, unless the device cannot tell it.
-        known = result.safe or self._loaded.config.safe.at_start is None
-        return StallError(text) if known and codes & _OF_STALLS else RunError(text)
+        return fault_of(text, result, recording, self._loaded.config.safe.at_start)
 
     def _kept(self, path: Path, settings: list[str]) -> Recording | None:
         """Return the recording of a step that is done; otherwise None.
@@ -331,16 +321,6 @@ class CharacterisationRunner:
             settings.append(f"safe.at_start={self.limits.rest!r}")  # where the previous step ended
         # Noise common to all steps would be fitted.
         return settings + self._loaded.noise_settings(number)
-
-
-def _repeated(record: Callable[[], Recording]) -> Recording:
-    """Return the recording of a step, which is run again if a stall ends it."""
-    for number in range(1, REPEATS + 1):
-        try:
-            return record()
-        except StallError as error:
-            _log.warning("%s; the step is repeated (%d of %d)", error, number, REPEATS)
-    return record()
 
 
 def _missing(recording: Recording) -> float:

@@ -19,6 +19,7 @@ from hilctl.ilc.ilc_session import (
     row_of,
 )
 from hilctl.ilc.update import IlcState
+from hilctl.recording.reader import read
 from hilctl.run.result import RunResult
 from hilctl.run.start import checked_experiment, unpaced
 
@@ -37,6 +38,7 @@ class Runs:
         self.settings.append(settings)
         if len(self.settings) <= self.last:
             return unpaced(path, settings, output)
+        unpaced(path, settings, output)
         return RunResult(output, self.code, "by a test", "confirmed", self.stop_signal, 0, 0, 0)
 
 
@@ -69,6 +71,20 @@ def test_a_run_that_is_stopped_leaves_what_was_learned(tmp_path):
 def test_a_fault_is_one_and_leaves_what_was_learned(tmp_path):
     found = learned(tmp_path, Runs(1))
     assert (found.stop_signal, found.fault) == (0, True)
+
+
+def test_a_run_that_a_stall_ends_is_repeated(tmp_path):
+    lost = []
+
+    def run(path, settings, output):
+        fault = [] if lost else ['device.fault={"kind": "sensor_nan", "at_sample": 2000}']
+        result = unpaced(path, [*settings, *fault], output)
+        lost.extend(event.code for event in read(output).events if fault)
+        return result
+
+    found = learned(tmp_path, run, cycles=0)
+    assert ("sensor_invalid" in lost, found.fault) == (True, False)
+    assert [row.run for row in found.rows] == [0]
 
 
 def test_a_first_run_that_fails_is_an_error(tmp_path):

@@ -113,7 +113,7 @@ def test_the_command_is_ahead_by_the_losses():
         assert self_growth * size < 0.9
         lost = growth * size + bend * size**2 + excess / math.sqrt(size + even)
         lost = e * (1.0 / (1.0 - self_growth * size) + lost)
-        expected.append(w[k - 1] + LOSSES[9] * (w[k] - w[k - 1]) + mean * z + (1.0 - mean) * lost)
+        expected.append(w[k - 1] + late * (w[k] - w[k - 1]) + mean * z + (1.0 - mean) * lost)
         z = left * z + (1.0 - left) * lost
     assert run(duhem_inverse, y, LOSSES) == pytest.approx(expected, abs=1e-9)
 

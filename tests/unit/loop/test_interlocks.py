@@ -129,7 +129,7 @@ class TestMissing:
 
     def test_ends_a_run_by_default(self):
         trip, bench = trips(STROKE, 4, first=100, displacement=[1.0, np.nan, 2.0, np.nan])
-        assert (trip.sample, trip.code) == (101, "stroke")
+        assert (trip.sample, trip.code) == (101, "sensor_invalid")
         assert bench.flagged(Flag.SENSOR_INVALID) == [1, 3]
 
     @pytest.mark.parametrize(("missing", "sample"), [(3, None), (4, 14)])
@@ -139,7 +139,7 @@ class TestMissing:
         trip, bench = trips(
             replace(self.LIMITS, measured_deviation_a=None), 30, displacement=readings
         )
-        assert (trip and (trip.sample, trip.code)) == (sample and (sample, "stroke"))
+        assert (trip and (trip.sample, trip.code)) == (sample and (sample, "sensor_invalid"))
         assert bench.flagged(Flag.SENSOR_INVALID) == [1, *range(11, 11 + missing)]
 
     def test_a_permitted_one_does_not_hide_another_reason(self):
@@ -149,7 +149,7 @@ class TestMissing:
     def test_skipped_samples_count(self):
         bench = Fed(self.LIMITS)
         assert bench.feed(1, measured=0.0, displacement=np.nan) is None
-        assert bench.feed(1, first=9, measured=0.0, displacement=np.nan).code == "stroke"
+        assert bench.feed(1, first=9, measured=0.0, displacement=np.nan).code == "sensor_invalid"
 
     def test_neither_ends_nor_continues_other_times(self):
         limits = replace(self.LIMITS, tracking_error_um=1.0, tracking_s=0.002)
@@ -253,7 +253,7 @@ class TestFrozen:
 
     def test_invalid_readings_are_not_frozen(self):
         trip, bench = trips(FROZEN, 100, command=np.arange(100.0), displacement=np.nan)
-        assert trip.code == "stroke"
+        assert trip.code == "sensor_invalid"
         assert bench.flagged(InterlockFlag.SENSOR_FROZEN) == []
 
 
@@ -423,7 +423,9 @@ class TestSeveral:
             bench.feed(1, command=0.0, measured=0.0)
             bench.feed(1, first=1, command=0.0 if "command" in change else 9.0, measured=0.0)
             told.append(bench.feed(1, first=2, **{**moving, **change}).code)
-        assert told == ["stroke", "sensor_frozen", "deviation", "thermal", "tracking_error"]
+        assert told == [
+            "sensor_invalid", "sensor_frozen", "deviation", "thermal", "tracking_error",
+        ]  # fmt: skip
 
     def test_the_first_sample_counts(self):
         reference = np.array([0.0, 9.0, 0.0])

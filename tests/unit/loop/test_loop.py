@@ -297,7 +297,7 @@ def test_an_interlock_that_trips_after_a_stop_is_recorded(latency):
     assert (outcome.code, outcome.reason) == ("stopped", "stopped by a test")
     (event,) = rig.host.events
     assert (event.level, event.sample) == ("error", 43)
-    assert event.code == "stroke"
+    assert event.code == "sensor_invalid"
 
 
 def test_device_lost_on_the_ramp_keeps_the_first_reason():

@@ -10,10 +10,10 @@ import pytest
 from hilctl.base.errors import InputError, RunError
 from hilctl.experiment.load import load_experiment
 from hilctl.recording.reader import read
+from hilctl.run.stalls import REPEATS
 from hilctl.run.start import StepStoppedError, unpaced
 from hilctl.studies.characterise import characterisation_runner
 from hilctl.studies.characterise.characterisation_runner import (
-    REPEATS,
     CharacterisationRunner,
     without_reference,
 )
