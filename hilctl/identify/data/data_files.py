@@ -183,7 +183,9 @@ def load_records(
             units |= {unit} if unit else set()
             records.append(history if settings.whole else find_cycles(history, settings.points))
         elif settings.whole:
-            records.append(history_from_pieces(chain([first], pieces)))
+            history = history_from_pieces(chain([first], pieces))
+            at_rest = first.run.get("simulated") == "true"
+            records.append(history if at_rest else from_known_state(history))
         else:
             # Excluded segments need not have a steady cycle.
             chosen = kept if left_out else ()
@@ -209,19 +211,18 @@ def _from_table(path: Path, settings: IdentifySettings, lag_samples: int) -> Tab
     return TableRecord(history, read.unit, text)
 
 
-AT_REST = 0.01  # of the range of a command: it begins at rest
 AT_END = 0.05  # of the range of a command: it is at an end of it
 
 
 def from_known_state(history: History) -> History:
     """Return a history that is not evaluated until its own motion determines its state.
 
-    A history that does not begin at a command of 0 has an unknown past, which the first motion
-    over the range erases. If that is not in its first half, its first turn ends the worst of it.
+    A real actuator has an unknown past, also at a command of 0. The first motion over the range
+    erases it. If that is not in the first half, the first turn ends the worst of it.
     """
     command = history.command
     span = float(np.ptp(command))
-    if history.ignore or abs(command[0]) < AT_REST * span:
+    if history.ignore:
         return history
     ends = command <= command.min() + AT_END * span, command >= command.max() - AT_END * span
     erased = max(int(end.argmax()) for end in ends)
