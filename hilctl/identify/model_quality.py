@@ -140,7 +140,8 @@ def _drift(error_um: F64, record: Record) -> str:
     )
     signals = [(record.time_s[first:], -error_um)]
     if turns.size > FEWEST_TURNS:
-        straight = np.polyval(np.polyfit(middles, middles_um, 1), middles)
+        line = np.stack((middles, np.ones_like(middles)), axis=1)
+        straight = line @ np.linalg.lstsq(line, middles_um)[0]
         signals.append((times_s, middles_um - straight))
     for time_s, off_um in signals:
         slope, start = np.polyfit(time_s, off_um, 1)

@@ -83,10 +83,10 @@ class Weights:
     errors_um: F64
     squares: float = 0.0  # weighted sum of squares of the operators' errors and of the prior
 
-    def errors_of(self, given: F64, y: F64) -> F64:
+    def errors_of(self, given: F64, y: F64, noise: F64) -> F64:
         """Return the errors of outputs of the operators at any rows: float64[N]."""
         curve = Curve(self.curve.operators, self.curve.displacement_um + self.offset_um)
-        return np.asarray(given - curve.operators_of(y))
+        return np.asarray(given - curve.operators_of(y) - noise)
 
 
 def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, creep: Creep | None = None) -> F64:
@@ -155,11 +155,15 @@ def outputs(
 class Equations:
     """Linear least squares of all weights, between operators and inverse curve.
 
-    ``columns`` is the result of :func:`table`, ``y`` the displacement without structure and delay,
-    ``least`` the smallest slope of the first line, ``scale`` the square root of each row's weight.
+    ``columns`` is the result of :func:`table`, ``y`` the displacement without structure, delay and
+    ``noise``, which is in units of the operators: otherwise the curve would be flattened where that
+    lessens noise. ``least`` is the smallest slope of the first line, ``scale`` the square root of
+    each row's weight.
     """
 
-    def __init__(self, columns: F64, y: F64, grid: Grid, least: float, scale: F64) -> None:
+    def __init__(
+        self, columns: F64, y: F64, noise: F64, grid: Grid, least: float, scale: F64
+    ) -> None:
         self._y, self._grid, self._scale = y, grid, scale
         moved = np.ptp(columns, axis=0)
         self._used = moved > MOVED * float(moved.max())
@@ -173,7 +177,7 @@ class Equations:
         self._share = np.diff(self._knots) / np.diff(self._knots)[anchor]
         bends = parts[:, [anchor]] * self._share[self._others] - parts[:, self._others]
         self._left = np.hstack([columns[:, self._used], bends])
-        self._target = float(self._share.sum()) * parts[:, anchor]
+        self._target = float(self._share.sum()) * parts[:, anchor] + noise
         self._lows = np.zeros(self._left.shape[1])
         self._lows[: grid.cells] = least
         self._lows[self._left.shape[1] - self._others.size :] = 1.0 / STEEPEST

@@ -44,10 +44,11 @@ STAGES = len(NAMES)
 
 @dataclass(frozen=True, slots=True)
 class BareSignal:
-    """Fields of the records, and displacements of the rows without structure and delay."""
+    """Fields of the records, and displacements of the rows without structure, delay and noise."""
 
     fields: Sequence[F64]
     y: F64
+    noise: F64
     scale: F64
     creep: Creep | None = None
 
@@ -93,7 +94,7 @@ class JointRefinement:
         if self._tried is None or not np.array_equal(self._tried[0], x):
             rows, grid = self._rows_of(x[:STAGES]), self._laid(x)
             columns = table(rows.fields, self._paths, grid, rows.creep)
-            equations = Equations(columns, rows.y, grid, self._least, rows.scale)
+            equations = Equations(columns, rows.y, rows.noise, grid, self._least, rows.scale)
             self._tried = x.copy(), equations, rows
         return self._tried[1:]
 
@@ -104,7 +105,7 @@ class JointRefinement:
         given, changes[:, STAGES:] = outputs(
             rows.fields, self._paths, grid, found.slopes, rows.creep
         )
-        here = found.errors_of(given, rows.y)
+        here = found.errors_of(given, rows.y, rows.noise)
         for i in range(STAGES):
             if self._space.low[i] == self._space.high[i]:
                 changes[:, i] = 0.0
@@ -113,7 +114,7 @@ class JointRefinement:
             there[i] += TRIED * unit[i] if x[i] + TRIED * unit[i] <= high[i] else -TRIED * unit[i]
             moved = self._rows_of(there[:STAGES])
             given, _ = outputs(moved.fields, self._paths, grid, found.slopes, moved.creep)
-            errors = found.errors_of(given, moved.y)
+            errors = found.errors_of(given, moved.y, moved.noise)
             changes[:, i] = (errors * moved.scale / rows.scale - here) / (there[i] - x[i])
         return equations.place(here, changes)
 
@@ -224,6 +225,7 @@ class FieldSearch:
     def _forget(self) -> None:
         self._curve = self._grid = None
         self._widest = 1.0
+        self._off_um = np.zeros(self._rows.scale.size)
 
     def _tried(self, stages: Stages, size: Size) -> tuple[float, Stages]:
         """Return the error of a start after two solutions for its weights."""
@@ -246,15 +248,18 @@ class FieldSearch:
     def _solved(self, x: F64) -> Weights:
         bare, grid = self._bare(x), self._laid()
         columns = table(bare.fields, self._rows.samples, grid, bare.creep)
-        return Equations(columns, bare.y, grid, self._least, bare.scale).solve()
+        return Equations(columns, bare.y, bare.noise, grid, self._least, bare.scale).solve()
 
     def _bare(self, x: F64) -> BareSignal:
         fields, bare = self._signals(x)
         y = np.concatenate([b[at] for b, at in zip(bare, self._rows.samples, strict=True)])
+        y += self._off_um
+        scale = self._scale(y)
+        noise = -self._off_um * self._rows.scale / scale
         known = physical(stages_in(x), self._data).activation
         steps_s = [run.step_s for run in self._data.runs]
         creep = None if known is None else Creep(known.width, known.rate, steps_s)
-        return BareSignal(fields, y, self._scale(y), creep)
+        return BareSignal(fields, y, noise, scale, creep)
 
     def _signals(self, x: F64) -> tuple[list[F64], list[F64]]:
         known = physical(stages_in(x), self._data)
@@ -276,10 +281,10 @@ class FieldSearch:
         return self._grid
 
     def _learn(self, x: F64) -> None:
-        """Solve for weights, and update the curve and the largest threshold for the next time."""
+        """Solve for weights, and update curve, errors and largest threshold for the next time."""
         found, grid = self._solved(x), self._laid()
         plays = grid.thresholds.size
-        self._curve = self._between(found)
+        self._curve, self._off_um = self._between(found), found.errors_um
         weights = found.slopes.sum(axis=1)
         tail = np.cumsum(weights[:plays][::-1])[::-1]
         beyond = int(np.argmax(np.append(tail, 0.0) < TAIL * float(weights.sum())))
@@ -309,6 +314,7 @@ class FieldSearch:
 
     def _choose(self, most: int) -> None:
         self._rows = chosen([run.motion for run in self._data.runs], most)
+        self._off_um = np.zeros(self._rows.scale.size)
 
     def _end(self, x: F64, before: Grid | None) -> FieldEnd:
         self._choose(POLISH_ROWS)
@@ -321,6 +327,7 @@ class FieldSearch:
         x, self._grid = self._polish(x)
         self._learn(x)
         self._choose(FINAL_ROWS)
+        self._learn(x)
         found = self._solved(x)
         known, held = physical(stages_in(x), self._data), self._space.at_bound(stages_in(x))
         return FieldEnd(known, self._laid(), found, self._curve, self._widest, held)

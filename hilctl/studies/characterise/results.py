@@ -12,7 +12,7 @@ from hilctl.analysis.response.frequency_response import FrequencyResponse
 from hilctl.analysis.response.segment_spectrum import RestNoise
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
-from hilctl.identify.data.data_files import from_known_state, without_gaps
+from hilctl.identify.data.data_files import without_gaps
 from hilctl.identify.data.records import History
 from hilctl.identify.evaluation import MotionError, largest_errors, motions_of, stroke_errors
 from hilctl.identify.fit_api import FitRequest
@@ -197,17 +197,20 @@ def identified(recordings: Mapping[str, Path], small: FrequencyResponse | None) 
 def _history(recording: Recording) -> History:
     """Return a recording up to the end of its last waveform, with gaps filled.
 
-    A simulated actuator begins at rest: the whole history of a drive of one sign, which never
-    erases that state, is evaluated.
+    Until the first waveform has been at both of its ends, the displacement depends on what the
+    actuator did before, so that part is not evaluated. A simulated actuator begins at rest: the
+    whole history of a drive of one sign, which never erases that state, is evaluated.
     """
     stop = recording.segments[-1].steady_stop
-    signals = without_gaps(recording, 0, stop)
-    held = np.setdiff1d(np.arange(stop), recording.samples.index, assume_unique=True)
-    history = History(recording.path.name, *signals, recording.sample_rate_hz, held=held)
-    begin = signals[0][: recording.segments[0].stop]
-    one_sign = not begin.min() < begin[0] < begin.max()
+    command, displacement_um = without_gaps(recording, 0, stop)
+    begin = command[: recording.segments[0].stop]
+    lowest, highest = int(begin.argmin()), int(begin.argmax())
+    one_sign = not begin[lowest] < begin[0] < begin[highest]
     at_rest = one_sign and recording.run.get("simulated") == "true"
-    return history if at_rest else from_known_state(history)
+    erased = 0 if at_rest else max(lowest, highest)
+    held = np.setdiff1d(np.arange(stop), recording.samples.index, assume_unique=True)
+    label, rate_hz = recording.path.name, recording.sample_rate_hz
+    return History(label, command, displacement_um, rate_hz, erased, held)
 
 
 def validated(

@@ -96,6 +96,13 @@ def test_drift_that_a_model_of_decaying_motions_hides_is_named():
     assert any("drifts by" in text for text in (*verdict.reasons, *verdict.notes)), verdict
 
 
+def test_turns_at_equal_distances_from_0_tell_drift_too():
+    time_s = np.arange(20_000) / 1000.0
+    command = 6.0 * np.round(np.sin(2.0 * np.pi * time_s), 3)
+    record = History("even", command, 5.0 * command + 0.4 * time_s, 1000.0)
+    assert "drifts by about 0.4 " in model_quality._drift(np.tile([1.0, -1.0], 10_000), record)
+
+
 def test_an_offset_is_suggested_where_the_error_is_one(grid):
     moved = changed(grid, lambda y: y + 4.0)
     verdict = judged(moved).verdict

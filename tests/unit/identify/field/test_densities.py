@@ -33,7 +33,7 @@ def displacement_um(given: F64) -> F64:
 
 def solved(y: F64, least: float = LEAST) -> Weights:
     """Return the weights for a displacement, each row of the same weight."""
-    return Equations(columns(), y, GRID, least, np.ones(y.size)).solve()
+    return Equations(columns(), y, 0.0 * y, GRID, least, np.ones(y.size)).solve()
 
 
 def test_a_curve_goes_through_its_points_and_on_straight():
@@ -105,7 +105,7 @@ def test_no_slope_of_the_first_line_is_less_than_the_least():
 def test_a_column_that_does_not_move_has_no_weight():
     u = np.ascontiguousarray(2.5 * np.sin(np.linspace(0.0, 30.0, 500)))
     given = table([u], [np.arange(u.size)], GRID)
-    found = Equations(given, given.sum(axis=1), GRID, LEAST, np.ones(u.size)).solve()
+    found = Equations(given, given.sum(axis=1), 0.0 * u, GRID, LEAST, np.ones(u.size)).solve()
     assert (found.slopes[2, [0, 3]] == 0.0).all()  # cells of the drag that are never reached
     assert (found.slopes[0] >= LEAST).all()
     assert found.slopes[2, 1:3].min() > 0.0
@@ -134,10 +134,24 @@ def test_a_row_counts_by_the_square_of_its_scale():
     y, given = displacement_um(columns()), columns()
     y[::2] += 0.5
     scale = np.where(np.arange(y.size) % 2, 1.0, 1e-9)
-    freed = Equations(given, y, GRID, LEAST, scale).solve()
+    freed = Equations(given, y, 0.0 * y, GRID, LEAST, scale).solve()
     assert np.mean(freed.errors_um[::2]) == pytest.approx(-0.5, abs=0.05)
     assert np.mean(freed.errors_um[1::2]) == pytest.approx(0.0, abs=0.01)
-    twice = np.vstack([given, given]), np.concatenate([y, y])
+    twice = np.vstack([given, given]), np.concatenate([y, y]), np.zeros(2 * y.size)
     both = Equations(*twice, GRID, LEAST, np.concatenate([scale, scale])).solve()
-    heavy = Equations(given, y, GRID, LEAST, math.sqrt(2.0) * scale).solve()
+    heavy = Equations(given, y, 0.0 * y, GRID, LEAST, math.sqrt(2.0) * scale).solve()
     assert both.slopes == pytest.approx(heavy.slopes, rel=1e-6, abs=1e-6)
+
+
+def test_noise_that_is_known_does_not_bend_the_curve():
+    clean = displacement_um(columns())
+    noise_um = np.random.default_rng(3).normal(0.0, 2.0, clean.size)
+    true = solved(clean).curve
+    rise = 0.5 * (true.operators_of(clean + 1.0) - true.operators_of(clean - 1.0))
+    known = Equations(columns(), clean, rise * noise_um, GRID, LEAST, np.ones(clean.size)).solve()
+    y = np.linspace(clean.min(), clean.max())
+    bent = [
+        np.abs(each.curve.operators_of(y) - true.operators_of(y)).max()
+        for each in (known, solved(clean + noise_um))
+    ]
+    assert bent[0] < 0.3 * bent[1]

@@ -176,7 +176,7 @@ def displacement_um() -> F64:
 
 def followed(y: F64) -> tuple[F64, Grid]:
     """Return stages and operators at the minimum, for a path that no stage changes."""
-    bare = BareSignal([path()], y, np.ones(y.size))
+    bare = BareSignal([path()], y, 0.0 * y, np.ones(y.size))
     return JointRefinement(lambda _: bare, KEPT, GRID, LEAST, SPACE).follow(row(Stages()))
 
 
@@ -185,7 +185,7 @@ def test_a_threshold_goes_to_where_the_rods_yield():
     x, grid = followed(y)
     assert grid.thresholds[1] == pytest.approx(TRUE_R, abs=0.02)
     assert x == pytest.approx(row(Stages()))  # nothing follows from them here, so they stay
-    tables = [(table([path()], KEPT, each), y, each) for each in (GRID, grid)]
+    tables = [(table([path()], KEPT, each), y, 0.0 * y, each) for each in (GRID, grid)]
     ends = [Equations(*each, LEAST, np.ones(y.size)).solve() for each in tables]
     before, after = (np.std(end.errors_um) for end in ends)
     assert after < 0.3 * before
@@ -203,7 +203,7 @@ def test_a_stage_is_found_with_the_weights_free():
 
     def rows_of(stages: F64) -> BareSignal:
         bent = path() + 0.4 * (stages[0] - 0.16) / row(STEP)[0] * np.sin(np.arange(900) / 40.0)
-        return BareSignal([np.ascontiguousarray(bent)], y, np.ones(y.size))
+        return BareSignal([np.ascontiguousarray(bent)], y, 0.0 * y, np.ones(y.size))
 
     x, _ = JointRefinement(rows_of, KEPT, GRID, LEAST, SPACE).follow(first)
     assert x[0] == pytest.approx(0.16, abs=0.002)
