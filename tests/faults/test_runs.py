@@ -90,10 +90,13 @@ def test_impatience_does_not_skip_the_ramp(tmp_path):
 
 
 @pytest.mark.parametrize(
-    ("kind", "words"),
-    [("sensor_nan", "displacement at sample 9000"), ("sensor_jump", "stroke limits -60 to 60 µm")],
+    ("kind", "code", "words"),
+    [
+        ("sensor_nan", "sensor_invalid", "displacement at sample 9000"),
+        ("sensor_jump", "stroke", "stroke limits -60 to 60 µm"),
+    ],
 )
-def test_bad_sensor_ramps_down(tmp_path, kind, words):
+def test_bad_sensor_ramps_down(tmp_path, kind, code, words):
     """A reading that can't be trusted ends the run by its ramp."""
     device = {**EXPERIMENT["device"], "fault": {"kind": kind, "at_sample": 9000}}
     run = started(tmp_path, device=device)
@@ -105,7 +108,7 @@ def test_bad_sensor_ramps_down(tmp_path, kind, words):
     first = int(np.argmax((recording.samples.flags & Flag.SENSOR_INVALID.value) != 0))
     assert first >= 9000
     trip = recording.events[0]
-    assert (trip.code, trip.sample, trip.level) == ("sensor_invalid", first, "error")
+    assert (trip.code, trip.sample, trip.level) == (code, first, "error")
     assert trip.before.index.tolist() == list(range(first - 49, first + 1))
     part = recording.samples.part(first - 49, first + 1)
     assert np.array_equal(trip.before.command, part.command)
