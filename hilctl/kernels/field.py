@@ -48,8 +48,8 @@ width and n for the plays, width and c for the drags; k and a T / k of the creep
 Span: TypeAlias = tuple[float, float, float]
 Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
 """tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, g, e_0, the part that z
-before a sample has in its mean over the sample, of which the rest is h's; and the part that w after
-a sample has in its mean over the sample, of which the rest is that of w before."""
+before a sample has in its mean over the sample (the rest is h's), and the weight of w after a
+sample in its mean over the sample (the rest is that of w before)."""
 
 _BEFORE_POLE = 0.9
 _STEPS = 100

@@ -14,7 +14,7 @@ from hilctl.models.implicit_models import cell_problems, line_problems, play_tab
 
 _TOLERANCE_UM = 1e-6
 _EVEN = 1e-3
-_SHORTEST, _LONGEST = 1e-12, 1e3  # per time that passes; others differ in no digit, or little
+_SHORTEST, _LONGEST = 1e-12, 1e3  # relative lags and delays outside have nearly the same effect
 
 Time = Annotated[float, Field(ge=0.0, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -25,12 +25,17 @@ def even_excess(span: float) -> float:
     return _EVEN * span
 
 
-def part_in_mean(lags: F64, decays: F64) -> F64:
-    """Return the part of its end in a field's mean while it follows a held command: float64[n].
+def final_weight(lags: F64, decays: F64) -> F64:
+    """Return the weight of the final value in the mean of a field over an interval: float64[n].
 
-    ``lags`` and ``decays`` are the lag of slow changes and the delay of the losses, per the time:
-    float64[n]. The part is 1 for a field that arrives, a half of one that is slow. Of losses with a
-    delay only those count that a change has within the time.
+    The command is constant during the interval and the field follows with a first-order lag. The
+    weight is 0.5 for an interval much shorter than the lag, and 1 for one in which the field
+    settles; the rest is the weight of the initial value.
+
+    Args:
+        lags: Lag for small, slow changes, relative to the interval: float64[n].
+        decays: Delay of the losses, relative to the interval: float64[n]. Losses that a change
+            causes after the interval do not count.
     """
     decays = np.maximum(decays, _SHORTEST)
     within = np.clip(lags * (1.0 + decays * np.expm1(-1.0 / decays)), _SHORTEST, _LONGEST)
@@ -66,8 +71,8 @@ class FieldLosses(StrictModel):
     def sampled(self, sample_rate_hz: float, span: float, slope: float) -> Losses:
         """Return the losses in the form of the kernels.
 
-        A command is held, so field and losses count as means over a sample. ``span`` is that of the
-        effective fields, ``slope`` the mean slope of the operators in um per command unit.
+        A command is constant during a sample, so field and losses are means over it. ``span`` is
+        that of the effective fields, ``slope`` the operators' mean slope in um per command unit.
         """
         lags = self.decay_s * sample_rate_hz
         lag_s = self.field_s + self.output_s * slope
@@ -82,7 +87,7 @@ class FieldLosses(StrictModel):
             self.self_growth,
             even_excess(span),
             (1.0 - left) * lags,
-            float(part_in_mean(np.array(lag_s * sample_rate_hz), np.array(lags))),
+            float(final_weight(np.array(lag_s * sample_rate_hz), np.array(lags))),
         )
 
 

@@ -1,4 +1,4 @@
-"""Repeats of runs that a stall of the machine, the network or the device ended."""
+"""Retries of runs that a stall of the computer, the network or the device ended."""
 
 import logging
 from collections.abc import Callable
@@ -23,10 +23,10 @@ class StallError(RunError):
 def fault_of(
     text: str, result: RunResult, recording: Recording, at_start: float | None
 ) -> RunError:
-    """Return the fault of a run: a StallError if another run can tell where the output is.
+    """Return the fault of a run: a StallError if the run can be repeated, otherwise a RunError.
 
-    The next run reads the output, unless the device cannot tell it: then ``at_start`` is set, and
-    this run must have confirmed that its output is safe.
+    The next run must know the output. It reads it from the device, except if ``at_start`` is set:
+    then this run must have confirmed its safe value.
     """
     known = result.safe or at_start is None
     stalled = not _OF_STALLS.isdisjoint(event.code for event in recording.events)
@@ -34,10 +34,10 @@ def fault_of(
 
 
 def repeated(run: Callable[[], _Made]) -> _Made:
-    """Return the result of a run, which is repeated if a stall ends it."""
+    """Return the result of a run; repeat the run up to REPEATS times if a stall ends it."""
     for number in range(1, REPEATS + 1):
         try:
             return run()
         except StallError as error:
-            _log.warning("%s; it is repeated (%d of %d)", error, number, REPEATS)
+            _log.warning("%s; the run is repeated (%d of %d)", error, number, REPEATS)
     return run()

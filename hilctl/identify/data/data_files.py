@@ -217,8 +217,8 @@ AT_END = 0.05  # of the range of a command: it is at an end of it
 def from_known_state(history: History) -> History:
     """Return a history that is not evaluated until its own motion determines its state.
 
-    A real actuator has an unknown past, also at a command of 0. The first motion over the range
-    erases it. If that is not in the first half, the first turn ends the worst of it.
+    The state of a real actuator is unknown, also at a command of 0, until the first motion over the
+    whole range. If that motion is not in the first half, the record is used from its first turn.
     """
     command = history.command
     span = float(np.ptp(command))

@@ -156,9 +156,9 @@ class Equations:
     """Linear least squares of all weights, between operators and inverse curve.
 
     ``columns`` is the result of :func:`table`, ``y`` the displacement without structure, delay and
-    ``noise``, which is in units of the operators: otherwise the curve would be flattened where that
-    lessens noise. ``least`` is the smallest slope of the first line, ``scale`` the square root of
-    each row's weight.
+    ``noise``, which is in units of the operators. A curve fitted to noisy displacements would be
+    too flat where small motions have most weight. ``least`` is the smallest slope of the first
+    line, ``scale`` the square root of each row's weight.
     """
 
     def __init__(

@@ -13,7 +13,7 @@ from hilctl.base.types import F64, I64
 from hilctl.identify.data.records import History, Record, SteadyLoop
 from hilctl.identify.field.design_matrix import Motion, bare_displacement, corners
 from hilctl.identify.parallel import parallel_map
-from hilctl.models.effective_field import part_in_mean
+from hilctl.models.effective_field import final_weight
 from hilctl.models.linear_stages import smoothing_weights
 
 WIDER = 4.0  # of the first width: the second
@@ -100,17 +100,17 @@ class Run:
         """Time of each sample that is kept."""
         return self.kept / self.rate_hz
 
-    def late_command(self, lag_s: float, decay_s: float = 0.0) -> tuple[F64, F64]:
+    def late_command(self, lag_s: float, decay_s: float) -> tuple[F64, F64]:
         """Return the part of each step at which to take its command, and the command."""
         # So a lag's step is exact: the middle of a short one, the end of one that settles.
         return self._late.of((lag_s, decay_s), lambda: self._late_command(lag_s, decay_s))
 
     def _late_command(self, lag_s: float, decay_s: float) -> tuple[F64, F64]:
         step_s = np.maximum(self.step_s, 1.0 / self.rate_hz)
-        late = part_in_mean(lag_s / step_s, decay_s / step_s)
-        per_sample = self.rate_hz * np.array([lag_s, decay_s])
-        # A command is held in each sample of a step, not even throughout it.
-        held = (part_in_mean(per_sample[0], per_sample[1]) - 0.5) / (step_s * self.rate_hz)
+        late = final_weight(lag_s / step_s, decay_s / step_s)
+        # The command is a staircase, not a ramp, within a step of several samples.
+        sample_s = np.array(1.0 / self.rate_hz)
+        held = (final_weight(lag_s / sample_s, decay_s / sample_s) - 0.5) * sample_s / step_s
         return late, self.mean + 2.0 * (late - 0.5 - held) * (self.command - self.mean)
 
     def bare_um(self, delay_s: float, slope_s: float, bend_s2: float) -> F64:

@@ -31,8 +31,6 @@ class Stages:
     activation: float = 0.0  # width of the thermal activation of plays
 
 
-SHORTEST_S = 1e-9  # of lags
-
 NAMES = tuple(field.name for field in fields(Stages))
 PARAMETERS = (
     "field_s", "output_s", "decay_s", "growth", "excess", "self_growth",

@@ -60,7 +60,7 @@ def test_commands_of_long_steps_are_those_near_their_ends():
     slow = history(frequency_hz=1.0)
     fast = history()
     run = Prepared([fast, slow]).runs[1]
-    late, command = run.late_command(1e-3)
+    late, command = run.late_command(1e-3, 0.0)
     at = run.time_s[:-1] + late[1:] * np.diff(run.time_s)
     held_s = 0.5 / RATE_HZ  # a command is held until the next: on the mean it is half a sample old
     wanted = 1.0 + 5.0 * np.sin(2.0 * np.pi * (at - held_s))
@@ -78,7 +78,7 @@ def test_a_lag_is_exact_over_steps_of_any_length(lag_s, samples):
     step_s, mean = np.array([samples / RATE_HZ]), np.array([2.0 + samples])
     motion = np.zeros((3, 1))
     run = Run(RATE_HZ, np.arange(1), step_s, mean + samples, mean, motion, 0)
-    late, command = run.late_command(lag_s)
+    late, command = run.late_command(lag_s, 0.0)
     assert command / (late + lag_s / step_s) == pytest.approx(field)
 
 
@@ -129,9 +129,9 @@ def test_what_was_found_last_does_not_stand_for_other_arguments():
     for each, bare_um in zip(reversed(asked), reversed(found), strict=True):
         np.testing.assert_array_equal(other.bare_um(*each), bare_um)
     assert all((a != b).any() for a, b in pairwise(found))
-    late = [run.late_command(lag_s) for lag_s in (1e-3, 2e-3)]
-    np.testing.assert_array_equal(other.late_command(2e-3), late[1])
-    np.testing.assert_array_equal(other.late_command(1e-3), late[0])
+    late = [run.late_command(lag_s, 0.0) for lag_s in (1e-3, 2e-3)]
+    np.testing.assert_array_equal(other.late_command(2e-3, 0.0), late[1])
+    np.testing.assert_array_equal(other.late_command(1e-3, 0.0), late[0])
 
 
 SMOOTHING_RATE_HZ = 50_000.0
