@@ -251,14 +251,16 @@ def identified_range(data: FitData) -> IdentifiedRange:
 def smallest_um(record: Record) -> float:
     """Return the peak-to-peak of a loop, or of a history's smaller swings."""
     # A tenth of the path is in smaller ones: noise, and the end of decaying cycles.
+    displacement_um = record.displacement_um
     if isinstance(record, History):
-        at = turning_points(record.command)
-        swings_um = np.sort(np.abs(np.diff(record.displacement_um[at])))
+        at = record.ignore + turning_points(record.command[record.ignore :])
+        swings_um = np.sort(np.abs(np.diff(displacement_um[at])))
+        displacement_um = displacement_um[record.evaluated()]
         if swings_um.size >= FEWEST_SWINGS:
             way_um = np.cumsum(swings_um)
             found = float(swings_um[np.searchsorted(way_um, SMALL * way_um[-1])])
             return max(found, NOT_ZERO_UM)
-    return float(np.ptp(record.displacement_um))
+    return float(np.ptp(displacement_um))
 
 
 def frequencies_hz(record: Record) -> tuple[float, float]:

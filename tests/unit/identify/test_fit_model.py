@@ -284,6 +284,17 @@ def test_motions_frequencies_and_speed():
     assert identified_range(FitData([loop(1.0, 10.0, 0.5)])).frequency_hz[1] == 20.0
 
 
+def test_motions_that_are_not_evaluated_are_not_in_the_identified_range():
+    """Of two cycles, the first is from -10 and thus larger."""
+    command = np.sin(np.linspace(0.0, 4.0 * np.pi, 400))
+    displacement_um = 5.0 * command
+    displacement_um[0] = -10.0
+    record = History("sine", command, displacement_um, 1e3, ignore=200)
+    assert identified_range(FitData([record])).peak_to_peak_um == pytest.approx(
+        (10.0, 10.0), rel=0.01
+    )
+
+
 def test_of_a_history_the_frequencies_of_its_command():
     """A sweep from 2 to 20 Hz, a sine, and a sine with rests in which the sensor is noisy."""
     time_s = np.arange(20_000) / 1000.0
