@@ -25,6 +25,10 @@ MORE_RIGS = {
 }
 
 
+LEARNED_PERCENT = 0.05
+NOISE_SPREAD = 1.1
+
+
 def follow(folder, device, settings, within_percent, *, fast=True):
     rig, model, learned = (folder / f"{name}.yaml" for name in ("rig", "model", "learned"))
     api.init(device, rig, settings=settings)
@@ -39,7 +43,9 @@ def follow(folder, device, settings, within_percent, *, fast=True):
     assert before < 2.0
     result = api.learn(rig, learned, settings=found.first_run, fast=fast)
     assert learned.is_file()
-    assert result.check[0].error_percent < before
+    # A model without a residual error leaves only noise, whose peak differs from run to run.
+    noise_percent = max(LEARNED_PERCENT, NOISE_SPREAD * result.check[0].floor_percent)
+    assert result.check[0].error_percent < max(before, noise_percent)
 
 
 @pytest.mark.parametrize(("device", "settings", "percent"), RIGS.values(), ids=RIGS)

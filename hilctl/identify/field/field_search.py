@@ -256,9 +256,12 @@ class FieldSearch:
         y += self._off_um
         scale = self._scale(y)
         noise = -self._off_um * self._rows.scale / scale
-        known = physical(stages_in(x), self._data).activation
-        steps_s = [run.step_s for run in self._data.runs]
-        creep = None if known is None else Creep(known.width, known.rate, steps_s)
+        known, runs = physical(stages_in(x), self._data), self._data.runs
+        # Otherwise a delay of half a sample would fit best, because it averages noise.
+        gains = [run.noise_gain(known.delay_s) for run in runs]
+        scale /= np.repeat(gains, [at.size for at in self._rows.samples])
+        plays, steps_s = known.activation, [run.step_s for run in runs]
+        creep = None if plays is None else Creep(plays.width, plays.rate, steps_s)
         return BareSignal(fields, y, noise, scale, creep)
 
     def _signals(self, x: F64) -> tuple[list[F64], list[F64]]:

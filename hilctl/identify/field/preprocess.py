@@ -92,6 +92,7 @@ class Run:
     mean: F64  # float64[n], the command's mean over each step
     derivatives: F64  # float64[3, N], displacement of all samples in um and its derivatives by time
     motion: Motion
+    noise_correlation: float = 0.0  # of the smoothed displacements of neighbouring samples
     _late: Latest[tuple[F64, F64]] = field(default_factory=Latest, init=False, repr=False)
     _bare: Latest[F64] = field(default_factory=Latest, init=False, repr=False)
 
@@ -117,6 +118,11 @@ class Run:
         """Return the displacement before delay and structure: float64[n]."""
         key = delay_s, slope_s, bend_s2
         return self._bare.of(key, lambda: self._bare_um(*key))
+
+    def noise_gain(self, delay_s: float) -> float:
+        """Return the factor by which the interpolation of :meth:`bare_um` reduces sensor noise."""
+        part = (delay_s * self.rate_hz) % 1.0
+        return math.sqrt(1.0 - 2.0 * part * (1.0 - part) * (1.0 - self.noise_correlation))
 
     def _bare_um(self, delay_s: float, slope_s: float, bend_s2: float) -> F64:
         out = np.empty(self.kept.size)
@@ -156,7 +162,16 @@ class Prepared:
         step_s, both = steps / rate_hz, (at_end, derivatives[0, kept])
         judged = record.evaluated()[kept]
         motion = Motion.of(both, step_s, judged, self.reach, self.stroke_um)
-        return Run(rate_hz, kept, step_s, at_end, mean, derivatives, motion)
+        correlation = _noise_correlation(width)
+        return Run(rate_hz, kept, step_s, at_end, mean, derivatives, motion, correlation)
+
+
+def _noise_correlation(width: float) -> float:
+    """Return the correlation of neighbouring samples' noise after :func:`smoothed`."""
+    weights = smoothing_weights(width)[0]
+    if weights.max() < 1.0 - LEAST:  # then the wider window determines the noise
+        weights = smoothing_weights(WIDER * width)[0]
+    return float(weights[1:] @ weights[:-1] / (weights @ weights))
 
 
 def histories_of(records: Sequence[Record], what: str) -> list[History]:

@@ -9,7 +9,15 @@ import pytest
 
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History
-from hilctl.identify.field.preprocess import LONGEST, OFF, POINTS, Prepared, Run, smoothed
+from hilctl.identify.field.preprocess import (
+    LONGEST,
+    OFF,
+    POINTS,
+    SMOOTHED,
+    Prepared,
+    Run,
+    smoothed,
+)
 
 RATE_HZ = 10_000.0
 
@@ -188,3 +196,17 @@ def test_a_record_with_few_samples_a_cycle_is_left_as_it_is(width):
 @pytest.mark.parametrize("size", [3, 30, 200])
 def test_short_records_are_smoothed_too(size):
     assert smoothed(np.linspace(0.0, 1.0, size), WIDTH, SMOOTHING_RATE_HZ).shape == (3, size)
+
+
+@pytest.mark.parametrize("delay_samples", [0.0, 0.3, 2.5])
+@pytest.mark.parametrize("top_hz", [1000.0, 50.0], ids=["raw", "smoothed"])
+def test_the_noise_gain_is_that_of_the_interpolation(delay_samples, top_hz):
+    time_s = np.arange(20_000) / RATE_HZ
+    command = np.sin(2.0 * np.pi * top_hz * time_s)
+    run = Prepared([History("sine", command, command, RATE_HZ)]).runs[0]
+    noise = np.random.default_rng(1).standard_normal(40_000)
+    noise = smoothed(noise, SMOOTHED / (2.0 * np.pi * top_hz) * RATE_HZ, RATE_HZ)[0]
+    part = delay_samples % 1.0
+    late = (1.0 - part) * noise[:-1] + part * noise[1:]
+    gain = np.std(late) / np.std(noise)
+    assert run.noise_gain(delay_samples / RATE_HZ) == pytest.approx(gain, rel=0.02)
