@@ -40,6 +40,7 @@ _SLOW_TOP_HZ = 80.0
 _RATES_HZ = tuple(digit * 10.0**power for power in range(-2, 5) for digit in (1, 2, 5))
 _PACED_HZ, _BUFFERED_HZ = 1e3, 1e4
 _BLOCK_S = 0.01
+_PERMITTED_LATE = 3.0  # readings in succession of a sensor that sends unasked
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,6 +182,9 @@ def _first_values(info: DeviceInfo, limits: object) -> tuple[dict[str, Any], dic
     # Of loops over the whole range, with a margin; the starter sine and the ramp are slower.
     slew = round_hz(_SLEW_MARGIN * math.pi * highest_loop_hz(rate_hz) * (high - low))
     data["limits"], of_limits = _limits(info, low, high, slew)
+    if info.ages_readings:
+        data["limits"]["sensor_invalid_s"] = _PERMITTED_LATE / rate_hz
+        remarks["limits.sensor_invalid_s"] = "the sensor sends unasked, and may be late"
     data["safe"] = {
         "value": 0.0 if low <= 0.0 <= high else low,
         "ramp_s": rounded_down(1.0 / (math.pi * frequency_hz), 1),

@@ -7,6 +7,8 @@ from dataclasses import dataclass, replace
 from functools import cached_property, partial
 from pathlib import Path
 
+import numpy as np
+
 from hilctl.base.errors import ConfigError, DataError, InputError, RunError
 from hilctl.base.files import check_writable, exists, make_folder, write_text
 from hilctl.base.types import F64
@@ -324,6 +326,12 @@ class CharacterisationRunner:
 
 
 def _missing(recording: Recording) -> float:
-    """Return the share of samples that are missing, because their ticks were skipped."""
-    index = recording.samples.index
-    return 1.0 - index.size / (int(index[-1]) + 1 - int(index[0]))
+    """Return the share of missing samples: of the run, or of its multisine if that is larger.
+
+    Samples are missing if their ticks were skipped or they have no displacement.
+    """
+    samples = recording.samples
+    parts = [(int(samples.index[0]), int(samples.index[-1]) + 1)]
+    parts += [(s.steady_start, s.steady_stop) for s in recording.segments if s.kind == "multisine"]
+    good = samples.index[np.isfinite(samples.displacement_um)]
+    return max(1.0 - float(np.ptp(np.searchsorted(good, each)) / np.ptp(each)) for each in parts)

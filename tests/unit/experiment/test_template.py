@@ -96,6 +96,12 @@ def test_a_current_of_one_sign_has_a_range(tmp_path, name, settings, reader, hig
     assert limits.drive_a == limits.command_range == (0.0, high)
 
 
+def test_a_sensor_that_sends_unasked_may_be_late(tmp_path):
+    checked, _, _ = written(tmp_path, "bk_precision_1785b", (), reader="capancdt_6200")
+    config = checked.loaded.config
+    assert config.limits.sensor_invalid_s * config.sample_rate_hz == pytest.approx(3.0)
+
+
 def test_a_range_that_begins_a_little_below_zero_is_moved_about_its_middle(tmp_path):
     settings = ["device.amplifier.gain_v_per_v=10"]
     checked, _, _ = written(tmp_path, "labjack_t8", settings, unit="V")

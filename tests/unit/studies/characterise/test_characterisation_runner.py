@@ -112,6 +112,37 @@ def test_a_step_that_skips_ticks_is_run_again(experiment, monkeypatch):
     assert "01-rest.mcap" not in rig.names
 
 
+@pytest.mark.parametrize("missing", ["skipped", "invalid"])
+def test_a_multisine_with_gaps_is_run_again_though_the_run_has_few(
+    experiment, monkeypatch, missing
+):
+    def with_gaps(path):
+        whole = read(path)
+        samples = whole.samples
+        if "response" not in path.name:
+            return whole
+        (multisine,) = (each for each in whole.segments if each.kind == "multisine")
+        steady = (multisine.steady_start <= samples.index) & (samples.index < multisine.steady_stop)
+        bad = np.flatnonzero(steady)[::90]
+        assert bad.size < 0.01 * samples.index.size
+        if missing == "skipped":
+            return replace(whole, samples=samples.rows(np.delete(np.arange(steady.size), bad)))
+        samples.displacement_um[bad] = np.nan
+        return whole
+
+    steps = ("rest", "polarity", "response")
+    monkeypatch.setattr(
+        characterisation_runner, "STEPS", tuple(s for s in STEPS if s.name.startswith(steps))
+    )
+    rig = Rig()
+    with monkeypatch.context() as patched:
+        patched.setattr(characterisation_runner, "read", with_gaps)
+        with pytest.raises(RunError, match=r"response-1: .* 1.1 % "):
+            run(experiment, rig)
+    assert rig.names[-2:] == ["05-response-1.mcap"] * 2
+    assert rig.names.count("05-response-1.mcap") == 1 + REPEATS
+
+
 def test_recordings_with_other_settings_are_not_replaced(experiment):
     run(experiment, Rig())
     rig = Rig()
