@@ -67,6 +67,15 @@ def error_changes(
     )
 
 
+def error_ratio(runs: Sequence[ErrorChange]) -> float:
+    """Return error after over error before: root mean square of the relative errors of runs."""
+    after, before = (
+        np.mean([error**2 for error in errors])
+        for errors in zip(*((run.after, run.before) for run in runs), strict=True)
+    )
+    return float(np.sqrt(after / before))
+
+
 def worst_class(classes: Sequence[ErrorChange]) -> ErrorChange:
     """Return the class with the largest error after, and the largest error of a class before."""
     worst = max(classes, key=lambda each: each.after)

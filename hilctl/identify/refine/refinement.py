@@ -27,6 +27,7 @@ from hilctl.identify.refine.acceptance import (
     AcceptanceRule,
     ErrorChange,
     error_changes,
+    error_ratio,
     worst_class,
 )
 from hilctl.identify.refine.residual_fit import ResidualFit
@@ -41,6 +42,7 @@ ANCHORS = (100.0, 10.0, 3.0)
 AS_GOOD = 1.02  # of the least error on held-out runs
 STRETCHES = 10  # parts of a run that are evaluated separately
 MOST = 1.12  # maximum error of a part, of the old one
+LARGE_GAIN = 0.5  # error after over error before
 FOREGONE = 0.5  # part of the possible gain that even errors may cost
 
 
@@ -98,12 +100,8 @@ class SelectedRegularisation:
 
     @property
     def ratio(self) -> float:
-        """Error after over error before: root mean square of the relative errors of the runs."""
-        after, before = (
-            np.mean([error**2 for error in errors])
-            for errors in zip(*((run.after, run.before) for run in self.runs), strict=True)
-        )
-        return float(np.sqrt(after / before))
+        """Error of held-out runs after, over that before."""
+        return error_ratio(self.runs)
 
     @property
     def better(self) -> bool:
@@ -149,7 +147,7 @@ class Regularisation:
         rule: AcceptanceRule,
     ) -> None:
         self._parts, self._splits, self._unit = parts, splits, model.input_unit
-        self._rule = rule
+        self._rule, self._model = rule, model
         # All fitted parts; also the end of a single run that is cut in two.
         fitted = {i for split in splits for i in split.fitted}
         cut = parts[-1].label == parts[0].label
@@ -185,6 +183,15 @@ class Regularisation:
             return least
         good = (way for way in held if way[0].as_good(best[0]) and way[0].as_good(least[0]))
         return next(good, best)
+
+    def fitted_ratio(self, refined: RefinedModel, *, own: bool) -> float:
+        """Return the error of a model of all runs on these runs, over that of the old model."""
+        split = RegularisationSplit(self._whole, self._whole)
+        before, after = (
+            self._held_out({split: model}, own=own).judgement.errors
+            for model in (self._model, refined)
+        )
+        return error_ratio(error_changes(before, after))
 
     def _tried(
         self, strength: float, anchor: float, *, own: bool
@@ -275,11 +282,13 @@ class Refinement:
 
     Attributes:
         choice: Selected regularisation, with errors before and after on held-out runs.
+        fitted_ratio: Error after over error before on the runs that it was fitted to.
         reasons: Why it is no better than the old model; empty if it is better.
     """
 
     model: RefinedModel
     choice: SelectedRegularisation
+    fitted_ratio: float
     reasons: tuple[str, ...]
 
     @property
@@ -292,6 +301,16 @@ class Refinement:
         """Held-out runs whose error increases."""
         return [run for run in self.choice.runs if run.increase > 0.0]
 
+    @property
+    def limit(self) -> str:
+        """What limits the gain on held-out runs; empty if it is large, or there is none."""
+        if not self.better or self.choice.ratio <= LARGE_GAIN:
+            return ""
+        fitted = f"the error of fitted runs is {self.fitted_ratio:.2f} times the old one"
+        if self.fitted_ratio <= LARGE_GAIN:
+            return f"{fitted}: add runs of more strokes, places and frequencies"
+        return f"{fitted}: the rest is noise or drift, or needs a new model (hilctl characterise)"
+
     def __str__(self) -> str:
         if not self.better:
             return f"no better than the old model: {'; '.join(self.reasons)}"
@@ -299,6 +318,7 @@ class Refinement:
             f"better: {self.choice.ratio:.2f} times the old error on held-out runs; worst class: "
             f"{worst_class(self.choice.classes)}; "
             f"{len(self.worse)} of {len(self.choice.runs)} runs worse"
+            f"{self.limit and '; '}{self.limit}"
         )
 
     def to_mapping(self) -> dict[str, Any]:
@@ -308,6 +328,8 @@ class Refinement:
             "text": str(self),
             "reasons": list(self.reasons),
             "ratio": self.choice.ratio,
+            "fitted_ratio": self.fitted_ratio,
+            "limit": self.limit,
             "strength": self.choice.strength,
             "anchor": self.choice.anchor,
             "own_drift": self.choice.own,
@@ -334,10 +356,12 @@ def refine_runs(
     runs_um = [run.displacement_um[run.ignore :] for run in parts]
     range_um = float(np.ptp(ends_um) if ends_um else max(map(np.ptp, runs_um)))
     rule = AcceptanceRule(range_um, tolerance_percent)
-    choice, refined = Regularisation(old, parts, splits, rule).best(progress)
+    regularisation = Regularisation(old, parts, splits, rule)
+    choice, refined = regularisation.best(progress)
+    fitted_ratio = regularisation.fitted_ratio(refined, own=choice.own)
     progress(1.0, "done")
     named = refined.model_copy(update={"provenance": _provenance(old, runs, choice, source)})
-    return Refinement(named, choice, tuple(choice.reasons))
+    return Refinement(named, choice, fitted_ratio, tuple(choice.reasons))
 
 
 def _provenance(

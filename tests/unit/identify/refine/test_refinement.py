@@ -122,10 +122,30 @@ def test_swapped_wires_are_refused(old, runs):
 def test_runs_that_get_worse_are_named():
     before, after = held_out((0.03, 0.01)), held_out((0.01, 0.011))
     choice = refinement.SelectedRegularisation(0.1, 1.0, False, before, after, RULE)
-    found = refinement.Refinement(actuator(), choice, ())
+    found = refinement.Refinement(actuator(), choice, 1.0, ())
     assert [run.label for run in found.worse] == ["run 1"]
     assert [each["label"] for each in found.to_mapping()["worse"]] == ["run 1"]
     assert "run 1" in worse_lines(found)[0]
+
+
+@pytest.mark.parametrize(("after", "fitted_ratio", "remedy"), [
+    (0.004, 0.4, ""),
+    (0.008, 0.4, "add runs"),
+    (0.008, 0.7, "new model"),
+])  # fmt: skip
+def test_what_limits_a_small_gain_is_named(after, fitted_ratio, remedy):
+    before, now = held_out((0.01, 0.01)), held_out((after, after))
+    choice = refinement.SelectedRegularisation(0.1, 1.0, False, before, now, RULE)
+    found = refinement.Refinement(actuator(), choice, fitted_ratio, ())
+    assert (found.limit == "") == (remedy == "")
+    assert remedy in found.limit
+    assert str(found).endswith(found.limit)
+    assert found.to_mapping()["limit"] == found.limit
+
+
+@pytest.mark.slow
+def test_fitted_runs_gain_at_least_as_much_as_held_out_ones(found):
+    assert found.fitted_ratio < 1.05 * found.choice.ratio < 0.5
 
 
 def test_a_file_that_exists_is_refused_before_anything_is_read(tmp_path):
