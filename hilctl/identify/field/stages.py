@@ -39,7 +39,7 @@ PARAMETERS = (
 """Published names, in the same order."""
 LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0, 0.0)
 HIGH = Stages(2.0, 2.0, 0.3, 10.0, 0.5, 10.0, 0.3, 2.0, 0.3, 0.0)
-STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.01, 0.05, 0.02, 0.05, 0.01, 0.002)
+STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.01, 0.5, 0.02, 0.05, 0.01, 0.002)
 ACTIVATION = (0.002, 0.05)  # bounds of the width if plays creep
 """Bounds, and changes that have about the same effect."""
 
