@@ -40,7 +40,7 @@ _SLOW_TOP_HZ = 80.0
 _RATES_HZ = tuple(digit * 10.0**power for power in range(-2, 5) for digit in (1, 2, 5))
 _PACED_HZ, _BUFFERED_HZ = 1e3, 1e4
 _BLOCK_S = 0.01
-_PERMITTED_LATE = 3.0  # readings in succession of a sensor that sends unasked
+_PERMITTED_LATE = 3.0  # consecutive readings of a sensor that sends unasked
 
 
 @dataclass(frozen=True, slots=True)

@@ -303,7 +303,7 @@ class Refinement:
 
     @property
     def limit(self) -> str:
-        """What limits the gain on held-out runs; empty if it is large, or there is none."""
+        """What limits the gain on held-out runs; empty if it is large or zero."""
         if not self.better or self.choice.ratio <= LARGE_GAIN:
             return ""
         fitted = f"the error of fitted runs is {self.fitted_ratio:.2f} times the old one"
