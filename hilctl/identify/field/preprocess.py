@@ -61,6 +61,7 @@ SMOOTHED = 0.09  # window, in radians of the fastest cycle
 OFF = 5e-4  # deviation of straight lines from the displacement, of its peak-to-peak
 COMMAND_OFF = 1e-4  # the same for commands, at whose turns the operators turn
 SLOWEST_HZ = 0.35  # least top_hz: the longest lag, 1 s, belongs to it
+LONGEST_DELAY = 0.3  # in radians of the fastest cycle
 LONGEST = 0.3  # longest step, in cycles of the fastest
 
 
@@ -146,7 +147,8 @@ class Prepared:
 
     def _run(self, record: History) -> Run:
         rate_hz, command = record.sample_rate_hz, record.command
-        width = min(SMOOTHED / (2.0 * math.pi * self.top_hz), 1.0) * rate_hz
+        fast = 2.0 * math.pi * self.top_hz
+        width = min(SMOOTHED / fast, 1.0) * rate_hz
         derivatives = smoothed(record.displacement_um, width, rate_hz)
         thin = max(1, math.floor(rate_hz / (self._points * self.top_hz)))
         furthest = max(thin, math.floor(LONGEST * rate_hz / self.top_hz))
@@ -160,7 +162,9 @@ class Prepared:
         mean = np.full(kept.size, command[0])
         mean[1:] = np.diff(held[kept]) / np.diff(kept)
         step_s, both = steps / rate_hz, (at_end, derivatives[0, kept])
-        judged = record.evaluated()[kept]
+        # Smoothing and delay need later samples, which the end of a record does not have.
+        ahead = smoothing_weights(WIDER * width)[1] + LONGEST_DELAY * rate_hz / fast
+        judged = record.evaluated()[kept] & (kept < command.size - ahead)
         motion = Motion.of(both, step_s, judged, self.reach, self.stroke_um)
         correlation = _noise_correlation(width)
         return Run(rate_hz, kept, step_s, at_end, mean, derivatives, motion, correlation)

@@ -8,7 +8,7 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.identify.field.densities import Curve
-from hilctl.identify.field.preprocess import Prepared, Run
+from hilctl.identify.field.preprocess import LONGEST_DELAY, Prepared, Run
 from hilctl.identify.fit_api import Structure
 from hilctl.kernels.field import field_left
 from hilctl.models.effective_field import FieldLosses, ThermalActivation, even_excess
@@ -38,7 +38,7 @@ PARAMETERS = (
 )  # fmt: skip
 """Published names, in the same order."""
 LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0, 0.0)
-HIGH = Stages(2.0, 2.0, 0.3, 10.0, 0.5, 10.0, 0.3, 2.0, 0.3, 0.0)
+HIGH = Stages(2.0, 2.0, 0.3, 10.0, 0.5, 10.0, 0.3, 2.0, LONGEST_DELAY, 0.0)
 STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.01, 0.5, 0.02, 0.05, 0.01, 0.002)
 ACTIVATION = (0.002, 0.05)  # bounds of the width if plays creep
 """Bounds, and changes that have about the same effect."""

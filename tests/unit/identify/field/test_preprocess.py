@@ -11,6 +11,7 @@ from hilctl.base.types import F64
 from hilctl.identify.data.records import History
 from hilctl.identify.field.preprocess import (
     LONGEST,
+    LONGEST_DELAY,
     OFF,
     POINTS,
     SMOOTHED,
@@ -20,6 +21,7 @@ from hilctl.identify.field.preprocess import (
 )
 
 RATE_HZ = 10_000.0
+LAST = 4850  # sample of 5000 from which on later ones may be missing
 
 
 def history(frequency_hz: float = 20.0, samples: int = 5000, ignore: int = 0) -> History:
@@ -105,12 +107,28 @@ def test_what_is_left_is_enough_of_both_signals(frequency_hz):
 @pytest.mark.parametrize("ignore", [0, 1, 20, 21, 1003])
 def test_no_sample_is_judged_that_is_to_be_ignored(ignore):
     run = Prepared([history(ignore=ignore)]).runs[0]
-    assert run.motion.judged.tolist() == (run.kept >= ignore).tolist()
+    early = run.kept < LAST
+    assert run.motion.judged[early].tolist() == (run.kept[early] >= ignore).tolist()
+
+
+def test_no_sample_is_judged_whose_later_ones_are_missing():
+    """A record that ends in motion; the delay may take a sample ahead as well."""
+    run = Prepared([sine(5.0, 40.0)]).runs[0]
+    bare = run.bare_um(LONGEST_DELAY / (2.0 * math.pi * 40.0), 0.0, 0.0)
+    moved = 15.0 * np.sin(2.0 * np.pi * 40.0 * run.time_s + LONGEST_DELAY)
+    off = np.abs(bare - moved)
+    assert off.max() > 0.5
+    assert off[run.motion.judged].max() < 0.01
+    assert run.motion.judged[run.kept < LAST].all()
 
 
 def test_no_sample_is_judged_after_skipped_ticks():
     run = Prepared([replace(history(), held=np.arange(1000, 1020))]).runs[0]
-    assert run.motion.judged.tolist() == ((run.kept < 1000) | (run.kept >= 1080)).tolist()
+    early = run.kept < LAST
+    assert (
+        run.motion.judged[early].tolist()
+        == ((run.kept[early] < 1000) | (run.kept[early] >= 1080)).tolist()
+    )
 
 
 @pytest.mark.parametrize("delay_s", [0.0, 2.5e-4])
