@@ -193,6 +193,7 @@ def plays_given(
 LEAST_SWING = 0.1  # of the stroke: smaller swings count as this one
 TURN = 0.02  # of the stroke: minimum reversal of a turn
 AT_REST = 1e-4  # of the command's peak-to-peak: time of shorter steps counts less
+SMALL = 1.5  # exponent by which the swing reduces the weight of rows
 REPEATED = 0.5  # exponent by which the density of rows reduces their weight
 
 
@@ -246,6 +247,6 @@ def chosen(motions: Sequence[Motion], most: int) -> Rows:
         rows = rows[motion.judged[rows]]
         close = (swing / all_swung + time / all_passed)[rows] * all_passed / motion.step_s[rows]
         samples.append(rows.astype(np.int64))
-        weights.append(motion.swing[rows] ** -2.0 * close**-REPEATED)
+        weights.append(motion.swing[rows] ** -SMALL * close**-REPEATED)
     weight = np.concatenate(weights)
     return Rows(tuple(samples), np.sqrt(weight / weight.mean()))

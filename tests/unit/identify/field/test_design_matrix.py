@@ -5,7 +5,14 @@ import pytest
 
 from hilctl.base.types import F64
 from hilctl.identify.field.densities import Grid, table
-from hilctl.identify.field.design_matrix import LEAST_SWING, Motion, chosen, corners, turning_points
+from hilctl.identify.field.design_matrix import (
+    LEAST_SWING,
+    SMALL,
+    Motion,
+    chosen,
+    corners,
+    turning_points,
+)
 from hilctl.identify.field.field_search import FINER, tabled
 from hilctl.models.effective_field import FieldModel, OutputCurve
 
@@ -94,11 +101,11 @@ def counts(command: F64, most: int, cuts: list[int]) -> tuple[list[int], list[fl
     return [part.size for part in weights], [float(part.sum()) for part in weights]
 
 
-def test_small_loops_weigh_what_their_own_size_makes_of_an_error():
+def test_small_loops_weigh_more_than_large_ones():
     both = np.concatenate((sine(6.0, 20.0, 1.0), sine(2.0, 20.0, 1.0)))
     (large, small), (one, other) = counts(both, 2000, [10_000])
     assert large == pytest.approx(small, rel=0.05)
-    assert other / one == pytest.approx(9.0, rel=0.1)
+    assert other / one == pytest.approx(3.0**SMALL, rel=0.1)
 
 
 def test_no_swing_weighs_more_than_the_smallest_that_counts():
