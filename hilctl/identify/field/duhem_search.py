@@ -9,6 +9,7 @@ from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
+from numpy.polynomial import Polynomial
 from scipy.interpolate import RegularGridInterpolator
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
@@ -132,7 +133,7 @@ class Signals:
 
 MARGIN = 0.02  # of the stroke: margin of the table beyond the data
 WIDER = 1.1  # width of the band, of that of the data
-BINS = 60
+DEGREE = 5  # of the first centre line: the middle of the widest loops would be steep in places
 FLATTEST = 0.02  # minimum slope of the centre, of its mean
 TILT = 0.6  # first guess: change of the logarithm of the slope from centre to edge
 BENT, TILTED = 0.009, 0.0016  # weights of second and first differences, percent of the stroke
@@ -205,21 +206,13 @@ def laid_over(
 ) -> Layout:
     """Return a layout over the range of paths, with cells of y and across the band.
 
-    The centre is a line through y and w, float64[k] each; the middle of the paths if None.
+    The centre is a line through y and w, float64[k] each; a smooth line along the paths if None.
     """
     w = np.concatenate([path.field for path in paths])
     y = np.concatenate([path.displacement_um for path in paths])
-    edges = np.linspace(float(y.min()), float(y.max()), BINS + 1)
-    bins = np.clip(np.searchsorted(edges, y, side="right") - 1, 0, BINS - 1)
-    lows, highs = np.full(BINS, np.inf), np.full(BINS, -np.inf)
-    np.minimum.at(lows, bins, w)
-    np.maximum.at(highs, bins, w)
-    seen = np.isfinite(lows)
-    middles = (0.5 * (edges[1:] + edges[:-1]))[seen]
-    halves = 0.5 * (lows[seen] + highs[seen])
     room = MARGIN * float(np.ptp(y))
     nodes = np.linspace(float(y.min()) - room, float(y.max()) + room, cells + 1)
-    centre = _extended(nodes, *(line or (middles, halves)))
+    centre = _extended(nodes, *line) if line else Polynomial.fit(y, w, DEGREE)(nodes)
     least = FLATTEST * float(np.ptp(centre)) / cells
     centre = centre[0] + np.concatenate(([0.0], np.cumsum(np.maximum(np.diff(centre), least))))
     off = float(np.abs(w - np.interp(y, nodes, centre)).max())
@@ -263,16 +256,17 @@ def fading(logs: F64) -> F64:
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # maximum distance of two points of a path, of the span
 COARSE_ROWS, FINE_ROWS = 4000, 12_000
 COARSE = (12, 8)  # cells of the first table
-FIRM, FIRMER = 100.0, 3000.0  # factors of the prior: for the first table, for its first steps
+FIRM = 3000.0  # factor of the prior for the first steps
 TABLE_ALONE = 3  # first steps, with constant stages
-STEPS_COARSE, STEPS_FINE, STEPS_LOOSE = 18, 8, 8
+STEPS_COARSE, STEPS_FINE = 18, 8
 COARSE_GAIN, FINE_GAIN = 3e-2, 3e-3  # relative gain of a step that ends the search
 SHORT_GAIN = 0.03  # factor of the gain, if the damping of the step was raised
 TRIALS = 12  # dampings of a step; a start that is far off needs the largest
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 REFUSED_DAMPING = 1e-5  # minimum after a rejected step
+TRUSTED = 0.1  # of the gain predicted by the derivatives: a step that gains less is rejected
 DIFFERENCE = 0.2  # step of numerical derivatives, of the step of a stage
-HELD, LOOSE = 1e-3, 1e-4  # penalties of the change of a stage, percent of the stroke per step
+COARSE_HELD, HELD = 1e-2, 1e-3  # percent of the stroke per step: penalty of the change of a stage
 
 
 @dataclass(frozen=True, slots=True)
@@ -301,7 +295,8 @@ class DuhemSearch:
         self._first = np.clip(FIRST, self._low, self._high)
         self._signals = Signals(data)
         self._size = cells, across
-        self._held, self._fades = HELD**2, False
+        # The misfit of a coarse table is larger than the effect of some stages.
+        self._held, self._fades = COARSE_HELD**2, False
         mean = np.log(data.stroke_um / (2.0 * data.reach))
         self._log_range = float(np.log(least)), float(mean + STEEPEST)
 
@@ -319,11 +314,11 @@ class DuhemSearch:
         logs = self._layout.first_logs()
         # Without a strong prior, first steps bring slopes that few loops reach to extreme values,
         # from which the search does not return.
-        self._hold(FIRMER)
+        self._prior = FIRM * self._smooth
         self._fades = True
         x, logs = self._descend(x, logs, TABLE_ALONE, 0.0, stages=False)
         progress(0.1, "a coarse table")
-        self._hold(FIRM)
+        self._prior = self._smooth
         x, logs = self._descend(x, logs, STEPS_COARSE, COARSE_GAIN)
         self._fades = False
         progress(0.5, "the table")
@@ -337,19 +332,15 @@ class DuhemSearch:
         self._layout = end.layout
         self._first_um = self._rest_um(path)
         x[-1] = self._signals.offset_in(end.offset_um, self._first_um)
-        self._held = LOOSE**2
         return self._end(x, end.logs, end.layout)
 
     def _end(self, x: F64, logs: F64, before: Layout) -> DuhemEnd:
         """Search with a table of the requested size, from another table."""
+        self._held = HELD**2
         # Slopes have a kink on the anhysteretic line, which nodes represent and cells would not.
         line = before.nodes_um, before.anhysteretic(logs)
         self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_ROWS), *self._size, line))
         x, logs = self._descend(x, self._layout.moved(logs, before), STEPS_FINE, FINE_GAIN)
-        # The penalty leads here, but it is larger than the misfit of a wrong law of the losses.
-        if self._held > LOOSE**2:
-            self._held = LOOSE**2
-            x, logs = self._descend(x, logs, STEPS_LOOSE, FINE_GAIN)
         offset_um = self._signals.offset_um(x, self._first_um)
         known, flux = self._signals.known(x), self._signals.flux(x)
         held = self._space.at_bound(stages_in(x[: len(STAGES)]))
@@ -366,11 +357,8 @@ class DuhemSearch:
         self._layout = layout
         self._fields: Latest[F64] = Latest()
         rows = prior(layout)
-        self._smooth = self._prior = rows.T @ rows
-
-    def _hold(self, times: float) -> None:
-        """Multiply the prior by a factor."""
-        self._prior = times * self._smooth
+        self._smooth: F64 = rows.T @ rows
+        self._prior = self._smooth
 
     def _rest_um(self, path: Path) -> float:
         """Return the displacement at zero field, from the first point and the centre line."""
@@ -393,7 +381,7 @@ class DuhemSearch:
                     to_x, to_logs = self._stepped(x, logs, step)
                     to_errors = self._errors(to_x, to_logs)
                     to_cost = self._cost(to_x, to_logs, to_errors)
-                    if to_cost < cost:
+                    if cost - to_cost > TRUSTED * float(step @ (2.0 * down - normal @ step)):
                         break
                 damping = max(10.0 * damping, REFUSED_DAMPING)
             else:
