@@ -114,6 +114,14 @@ class Log:
             assert time.monotonic() < deadline, f"no {event}"
             time.sleep(0.02)
 
+    def await_output(self, output: str, current_a: float) -> list[dict]:
+        """Wait until the last write has this value; return all writes."""
+        deadline = time.monotonic() + 30.0
+        while abs((writes := self.writes(output))[-1]["current_a"] - current_a) > 1e-5:
+            assert time.monotonic() < deadline, writes[-1]
+            time.sleep(0.02)
+        return writes
+
     def await_events(self, output: str, count: int, run: subprocess.Popen) -> None:
         deadline = time.monotonic() + 240.0
         while (seen := len(self.events(output))) < count:
