@@ -59,17 +59,27 @@ def bare_displacement(
 
 
 @kernel()
-def turning_points(u: F64, distance: float, out: I64) -> int:
-    """Fill in turns of a path, and samples at most ``distance`` apart; return their number."""
+def turning_points(u: F64, distance: float, turn: float, out: I64) -> int:
+    """Fill in turns of a path, and samples at most ``distance`` apart; return their number.
+
+    A path turns where it then returns by more than ``turn``, so noise at rest makes no turns.
+    """
     out[0] = 0
-    last, count = u[0], 1
+    count, furthest, way = 1, 0, 0.0  # the furthest sample since the last turn
     for k in range(1, u.size):
-        end = k == u.size - 1
-        turns = not end and (u[k] - u[k - 1]) * (u[k + 1] - u[k]) < 0.0
-        way = abs(u[k] - last)
-        if end or way >= distance or (turns and way >= 0.02 * distance):
+        forth = (u[k] - u[furthest]) * way
+        if way == 0.0 and abs(u[k] - u[0]) > turn:
+            way = math.copysign(1.0, u[k] - u[0])
+            furthest = k
+        elif forth > 0.0:
+            furthest = k
+        elif forth < -turn:
+            if furthest > out[count - 1]:
+                out[count] = furthest
+                count += 1
+            furthest, way = k, -way
+        if abs(u[k] - u[out[count - 1]]) >= distance or k == u.size - 1:
             out[count] = k
-            last = u[k]
             count += 1
     return count
 
@@ -193,7 +203,7 @@ def plays_given(
 LEAST_SWING = 0.1  # of the stroke: smaller swings count as this one
 TURN = 0.02  # of the stroke: minimum reversal of a turn
 AT_REST = 1e-4  # of the command's peak-to-peak: time of shorter steps counts less
-SMALL = 1.5  # exponent by which the swing reduces the weight of rows
+SMALL = 1.25  # exponent by which the swing reduces the weight of rows
 REPEATED = 0.5  # exponent by which the density of rows reduces their weight
 
 

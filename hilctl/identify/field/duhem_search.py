@@ -100,12 +100,12 @@ class Signals:
         """Undo :meth:`offset_um`, clipped to the bounds."""
         return float(np.clip((offset_um - first_um) / self._half_um, -_OFFSET, _OFFSET))
 
-    def choose(self, x: F64, way: float) -> None:
-        """Choose the points of all paths, at most ``way`` of the command's span apart."""
-        kept = []
+    def choose(self, x: F64, way: float, turn: float) -> None:
+        """Choose points of all paths: turns, and at most ``way`` of the command's span apart."""
+        kept, span = [], 2.0 * self._data.reach
         for field, _ in self._whole(x):
             out = np.empty(field.size, dtype=np.int64)
-            count = turning_points(field, way * 2.0 * self._data.reach, out)
+            count = turning_points(field, way * span, turn * span, out)
             kept.append(out[:count].copy())
         self._kept = tuple(kept)
         self._motions = tuple(
@@ -134,7 +134,7 @@ class Signals:
 MARGIN = 0.02  # of the stroke: margin of the table beyond the data
 WIDER = 1.1  # width of the band, of that of the data
 DEGREE = 5  # of the first centre line: the middle of the widest loops would be steep in places
-FLATTEST = 0.02  # minimum slope of the centre, of its mean
+FLATTEST = 0.2  # minimum slope of the centre, of its mean
 TILT = 0.6  # first guess: change of the logarithm of the slope from centre to edge
 BENT, TILTED = 0.009, 0.0016  # weights of second and first differences, percent of the stroke
 SHORTEST = 0.125  # of a cell: minimum step of a search
@@ -254,6 +254,7 @@ def fading(logs: F64) -> F64:
 
 
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # maximum distance of two points of a path, of the span
+COARSE_TURN, FINE_TURN = 3e-3, 1e-3  # of the span: minimum return after a turn
 COARSE_ROWS, FINE_ROWS = 4000, 12_000
 COARSE = (12, 8)  # cells of the first table
 FIRM = 3000.0  # factor of the prior for the first steps
@@ -266,7 +267,7 @@ FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 REFUSED_DAMPING = 1e-5  # minimum after a rejected step
 TRUSTED = 0.1  # of the gain predicted by the derivatives: a step that gains less is rejected
 DIFFERENCE = 0.2  # step of numerical derivatives, of the step of a stage
-COARSE_HELD, HELD = 1e-2, 1e-3  # percent of the stroke per step: penalty of the change of a stage
+COARSE_HELD, HELD = 1e-2, 3e-4  # percent of the stroke per step: penalty of the change of a stage
 
 
 @dataclass(frozen=True, slots=True)
@@ -308,7 +309,7 @@ class DuhemSearch:
     def find(self, progress: OnProgress) -> DuhemEnd:
         """Search with a coarse table, then with the requested size."""
         x = self._first.copy()
-        paths = self._chosen(x, COARSE_WAY, COARSE_ROWS)
+        paths = self._chosen(x, COARSE_WAY, COARSE_TURN, COARSE_ROWS)
         self._lay(laid_over(paths, *COARSE))
         self._first_um = self._rest_um(paths[0])
         logs = self._layout.first_logs()
@@ -328,7 +329,7 @@ class DuhemSearch:
         """Return the end of a search from the end of one with another table or data."""
         stages = self._space.within(stages_of(end.known, self._data))
         x = np.concatenate((stages, end.x[len(STAGES) :]))
-        path = self._chosen(x, COARSE_WAY, COARSE_ROWS)[0]
+        path = self._chosen(x, COARSE_WAY, COARSE_TURN, COARSE_ROWS)[0]
         self._layout = end.layout
         self._first_um = self._rest_um(path)
         x[-1] = self._signals.offset_in(end.offset_um, self._first_um)
@@ -339,15 +340,15 @@ class DuhemSearch:
         self._held = HELD**2
         # Slopes have a kink on the anhysteretic line, which nodes represent and cells would not.
         line = before.nodes_um, before.anhysteretic(logs)
-        self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_ROWS), *self._size, line))
+        self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_TURN, FINE_ROWS), *self._size, line))
         x, logs = self._descend(x, self._layout.moved(logs, before), STEPS_FINE, FINE_GAIN)
         offset_um = self._signals.offset_um(x, self._first_um)
         known, flux = self._signals.known(x), self._signals.flux(x)
         held = self._space.at_bound(stages_in(x[: len(STAGES)]))
         return DuhemEnd(known, self._layout, logs, flux, offset_um, x, held)
 
-    def _chosen(self, x: F64, way: float, rows: int) -> list[Path]:
-        self._signals.choose(x, way)
+    def _chosen(self, x: F64, way: float, turn: float, rows: int) -> list[Path]:
+        self._signals.choose(x, way, turn)
         paths = self._signals.paths(x)
         self._rows = chosen([path.motion for path in paths], rows)
         self._count = self._rows.scale.size

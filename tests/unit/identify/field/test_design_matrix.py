@@ -48,11 +48,22 @@ def test_columns_times_slopes_are_the_model():
 def test_turning_points_and_rows_are_enough_of_a_path():
     u = np.ascontiguousarray(path())
     kept = np.empty(u.size, dtype=np.int64)
-    kept = kept[: turning_points(u, 1.5, kept)].copy()
+    kept = kept[: turning_points(u, 1.5, 0.03, kept)].copy()
     assert kept.size < u.size / 5
     whole = table([u], [kept], GRID)
     few = table([np.ascontiguousarray(u[kept])], [np.arange(kept.size)], GRID)
     assert few == pytest.approx(whole, abs=0.02)
+
+
+def test_noise_makes_no_turns():
+    noise = 0.01 * np.sin(np.arange(300.0) ** 2)
+    u = np.concatenate([np.linspace(0.0, 3.0, 100), np.full(100, 3.0), np.linspace(3.0, 2.0, 100)])
+    out = np.empty(300, dtype=np.int64)
+    kept = out[: turning_points(u + noise, 1.5, 0.05, out)]
+    assert kept.size == 5
+    assert (kept[0], kept[-1]) == (0, 299)
+    assert np.ptp(u[kept]) == pytest.approx(3.0)  # with a sample of the rest, where it turns
+    assert (np.diff(kept) > 0).all()
 
 
 def test_straight_lines_between_corners_are_near_both_signals():

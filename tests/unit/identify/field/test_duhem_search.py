@@ -162,11 +162,11 @@ def test_the_flux_can_be_a_root_of_the_strain_nearly_down_to_where_that_begins()
 def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for():
     records = data()
     signals, (run,) = Signals(records), records.runs
-    signals.choose(FIRST, 1e-9)
+    signals.choose(FIRST, 1e-9, 0.0)
     (path,) = signals.paths(FIRST)
     assert path.field.size == path.displacement_um.size == run.kept.size
     assert path.motion.judged.size == path.field.size
-    signals.choose(FIRST, 0.05)
+    signals.choose(FIRST, 0.05, 1e-3)
     (coarse,) = signals.paths(FIRST)
     assert coarse.field.size < path.field.size / 2
     between = np.abs(np.diff(path.field)).max()
@@ -180,7 +180,7 @@ def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for():
 def test_paths_follow_every_stage_but_the_offset(stage):
     kept, fresh = Signals(data()), Signals(data())
     for signals in (kept, fresh):
-        signals.choose(FIRST, 0.02)
+        signals.choose(FIRST, 0.02, 1e-3)
     (before,) = kept.paths(FIRST)
     x = FIRST.copy()
     x[stage] += STEPS[stage]
@@ -201,7 +201,7 @@ SETTINGS = FitSettings(kind="generalised_duhem", cells=10, across=8)
 def ready(unit: float = 1.0, um: float = 1.0) -> tuple[DuhemSearch, F64]:
     """Return a search with a table laid, and its first logarithms."""
     job = DuhemSearch(data(unit, um), 8, 6, 0.05 * um / unit)
-    job._lay(laid_over(job._chosen(FIRST, 0.03, 500), 8, 6))
+    job._lay(laid_over(job._chosen(FIRST, 0.03, 1e-3, 500), 8, 6))
     job._first_um = 0.7 * um
     return job, job._layout.first_logs()
 
