@@ -295,8 +295,14 @@ function series(label, stroke, more = {}) {
   return { label, stroke, width: letter < 18 ? 1 : 0.1 * letter, points: { show: false }, ...more };
 }
 
+// Lines of a logarithmic axis stand at powers of ten: nine in each decade would hide a curve.
+function lined(plot, splits, axis) {
+  if (plot.scales[plot.axes[axis].scale].distr !== 3) return splits;
+  return splits.map((each) => (Number.isInteger(Number(Math.log10(each).toFixed(6))) ? each : null));
+}
+
 function axes(yLabel, xLabel, more = {}) {
-  const look = { stroke: colour("quiet"), grid: { stroke: colour("line"), width: 1 }, ticks: { stroke: colour("line") } };
+  const look = { stroke: colour("quiet"), grid: { stroke: colour("line"), width: 1, filter: lined }, ticks: { stroke: colour("line"), filter: lined } };
   const size = letter;
   const font = `${Math.round(0.8 * size)}px system-ui, sans-serif`;
   return [
@@ -398,7 +404,7 @@ function drawSmall() {
   last = Math.min(counts.length - 1, last + 1);
   plots["plot-late"].plot.setData([edges.slice(first, last + 1), counts.slice(first, last + 1)]);
   const late = status.lateness_us;
-  $("late-text").textContent = `p50 ${number(late.p50, 0, 5)}  p99 ${number(late.p99, 0, 6)}  max ${number(late.max, 0, 7)} µs · ${status.late_ticks} late`;
+  $("late-text").textContent = `p50 ${number(late.p50, 0, 4)} · p99 ${number(late.p99, 0, 5)} · max ${number(late.max, 0, 5)} µs · ${status.late_ticks} late`;
   if (plots["plot-spectrum"] && status.spectrum.hz.length) {
     plots["plot-spectrum"].plot.setData([status.spectrum.hz, status.spectrum.um.map((um) => Math.max(um, 1e-12))]);
   }
@@ -821,9 +827,11 @@ const dark = matchMedia("(prefers-color-scheme: dark)");
 theme(dark.matches ? "dark" : "light");
 dark.addEventListener("change", () => theme(dark.matches ? "dark" : "light"));
 $("theme").addEventListener("click", () => theme(document.documentElement.dataset.theme === "dark" ? "light" : "dark"));
-new ResizeObserver(() => {
+const resized = new ResizeObserver(() => {
   for (const [id, { plot }] of Object.entries(plots)) plot.setSize(sizes($(id)));
-}).observe(document.querySelector("main"));
+});
+// The text above the lateness may need a second line, which takes it from the plot.
+for (const each of [document.querySelector("main"), $("plot-late")]) resized.observe(each);
 
 // ---- at most one frame per refresh, each drawn once
 
