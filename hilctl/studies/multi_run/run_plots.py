@@ -1,6 +1,6 @@
 """Figures of runs side by side: loops, errors, step and frequency responses."""
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence, Sized
 from dataclasses import replace
 from functools import partial
 from itertools import cycle
@@ -87,10 +87,15 @@ def loop_sheets(series: RunSeries) -> Iterator[FigureSpec]:
                 Panel(partial(_draw_loops, along=along, runs=runs), title, _SQUARE)
                 for title, runs in spread(found, _MOST_PANELS)
             )
-            more = f", {len(panels)} of {len(found)} shown" if len(panels) < len(found) else ""
+            loops = max((runs for _, runs in found), key=len)
+            more = _part(panels, found, "shown") + _part(spread(loops), loops, "in each panel")
             caption = f"Average steady loops by {along.name}{more}."
             yield FigureSpec(name, caption, panels, alike=True)
             name = f"{name}_against_reference"
+
+
+def _part(shown: Sized, whole: Sized, where: str) -> str:
+    return f", {len(shown)} of {len(whole)} {where}" if len(shown) < len(whole) else ""
 
 
 def _groups(series: RunSeries, along: VariedParameter) -> list[tuple[str, list[Measured]]]:

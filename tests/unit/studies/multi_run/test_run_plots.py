@@ -68,6 +68,14 @@ def test_loops_by_each_number_at_values_of_the_others(crossed):
     assert (axes.get_xlabel(), axes.get_ylabel()) == ("command, A", "displacement, µm")
 
 
+def test_a_caption_counts_the_loops_and_panels_that_are_left_out():
+    runs = [grown(float(a), hz) for a in range(1, 10) for hz in (10.0, 100.0)]
+    many = RunSeries("loops", tuple(runs), tuple(runs[0].values), is_campaign=True)
+    sheets = {sheet.name: sheet.caption for sheet in loop_sheets(many)}
+    assert "6 of 9" in sheets["loops_by_frequency"]
+    assert "7 of 9" in sheets["loops_by_amplitude"]
+
+
 def test_a_value_has_one_colour_in_all_panels(crossed):
     sheet = next(iter(loop_sheets(crossed)))
     colours = [[line.get_color() for line in drawn(panel).lines] for panel in sheet.panels]
