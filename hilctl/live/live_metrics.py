@@ -150,6 +150,8 @@ class RunningFigures:
             return
         if segment is not self._segment:
             self._segment, self._group = segment, None
+        # Not the soft end: the metrics of the last steady cycles stay visible.
+        traces = traces.part(0, segment.steady_stop)
         while traces.index.size:
             if self._group is None:
                 self._group = self._begin(segment, int(traces.index[0]))
@@ -164,10 +166,11 @@ class RunningFigures:
         """Return the next group: complete cycles from the start of a cycle."""
         if segment.period <= 0.0:
             start = max(sample, segment.start)
-            stop = start + max(1, round(_GROUP_S * self._rate_hz))
+            stop = min(start + max(1, round(_GROUP_S * self._rate_hz)), segment.steady_stop)
             return _Group(start, stop, segment, compensated=self._compensated)
-        cycles = max(1, round(_GROUP_S * self._rate_hz / segment.period))
         passed = math.ceil(max(0, sample - segment.start) / segment.period - 1e-9)
+        left = math.floor((segment.steady_stop - segment.start) / segment.period - passed + 1e-9)
+        cycles = max(1, min(round(_GROUP_S * self._rate_hz / segment.period), left))
         start = segment.start + math.ceil(passed * segment.period - 1e-9)
         stop = segment.start + math.ceil((passed + cycles) * segment.period - 1e-9)
         return _Group(start, stop, segment, compensated=self._compensated)

@@ -51,6 +51,22 @@ def test_metrics_are_of_the_newest_complete_cycles():
     assert figures.newest["peak_error_um"] == pytest.approx(20 * np.sin(0.05), rel=1e-3)
 
 
+@pytest.mark.parametrize("period", [PERIOD, 0.0])
+def test_metrics_of_the_steady_part_stay_in_the_soft_end(period):
+    ending = Segment("sine", 30, 1630, 30, 1230, period)
+    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(30, 1230), ending)
+    steady = figures.newest
+    assert steady["peak_to_peak_um"] == pytest.approx(20.0, rel=1e-3)
+    added(figures, loop(1230, 1630, lag=2.0), ending)
+    assert figures.newest == steady
+
+
+def test_metrics_of_a_steady_part_that_is_shorter_than_a_group():
+    short = Segment("sine", 30, 400, 30, 260, PERIOD)
+    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(30, 400), short).newest
+    assert figures["peak_to_peak_um"] == pytest.approx(20.0, rel=1e-3)
+
+
 def test_invalid_samples_are_omitted():
     samples = loop(30, 1200)
     samples.values[[ROW["displacement"], ROW["error"]], 300] = 1e6
