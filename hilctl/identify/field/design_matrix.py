@@ -62,7 +62,7 @@ def bare_displacement(
 def turning_points(u: F64, distance: float, turn: float, out: I64) -> int:
     """Fill in turns of a path, and samples at most ``distance`` apart; return their number.
 
-    A path turns where it then returns by more than ``turn``, so noise at rest makes no turns.
+    A turn is a sample from which the path returns by more than ``turn``; less than that is noise.
     """
     out[0] = 0
     count, furthest, way = 1, 0, 0.0  # the furthest sample since the last turn

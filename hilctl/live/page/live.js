@@ -295,14 +295,14 @@ function series(label, stroke, more = {}) {
   return { label, stroke, width: letter < 18 ? 1 : 0.1 * letter, points: { show: false }, ...more };
 }
 
-// Lines of a logarithmic axis stand at powers of ten: nine in each decade would hide a curve.
-function lined(plot, splits, axis) {
+// A logarithmic axis has lines at powers of ten only: nine per decade would hide the curve.
+function decades(plot, splits, axis) {
   if (plot.scales[plot.axes[axis].scale].distr !== 3) return splits;
   return splits.map((each) => (Number.isInteger(Number(Math.log10(each).toFixed(6))) ? each : null));
 }
 
 function axes(yLabel, xLabel, more = {}) {
-  const look = { stroke: colour("quiet"), grid: { stroke: colour("line"), width: 1, filter: lined }, ticks: { stroke: colour("line"), filter: lined } };
+  const look = { stroke: colour("quiet"), grid: { stroke: colour("line"), width: 1, filter: decades }, ticks: { stroke: colour("line"), filter: decades } };
   const size = letter;
   const font = `${Math.round(0.8 * size)}px system-ui, sans-serif`;
   return [
@@ -830,7 +830,7 @@ $("theme").addEventListener("click", () => theme(document.documentElement.datase
 const resized = new ResizeObserver(() => {
   for (const [id, { plot }] of Object.entries(plots)) plot.setSize(sizes($(id)));
 });
-// The text above the lateness may need a second line, which takes it from the plot.
+// The plot of the lateness shrinks if the text above it takes a second line.
 for (const each of [document.querySelector("main"), $("plot-late")]) resized.observe(each);
 
 // ---- at most one frame per refresh, each drawn once
