@@ -286,21 +286,34 @@ def _play(
 
 
 @kernel(nogil=True)
-def play_path(
-    u: F64, step_s: F64, threshold: float, creep: float, rate: float, out: F64, by: F64
+def play_paths(
+    u: F64,
+    step_s: F64,
+    thresholds: F64,
+    creep: float,
+    rate: float,
+    rows: I64,
+    out: F64_2D,
+    by: F64_2D,
 ) -> None:
-    """Fill in a play from rest along a path, and its slope by the threshold: float64[n] each.
+    """Fill in plays from rest along a path, and their slopes by the thresholds: float64[p, N] each.
 
-    ``step_s``, float64[n], is the time of each step of ``u``, ``creep`` k and ``rate`` a / k.
+    ``step_s``, float64[n], is the time of each step of ``u``, ``creep`` k and ``rate`` a / k;
+    ``rows`` is int64[N], the points that are filled in, rising.
     """
-    held = last = slope = 0.0
+    held, slopes = np.zeros(thresholds.size), np.zeros(thresholds.size)
+    last, row = 0.0, 0
     for k in range(u.size):
         even = _even(u[k] - last, creep)
-        now, _, kept = _play(held, u[k], threshold, creep, rate * step_s[k], even)
-        slope = kept * slope - (1.0 - kept) * (1.0 if u[k] > held else -1.0)
-        slope = 0.0 if now == u[k] else slope
-        held, last = now, u[k]
-        out[k], by[k] = held, slope
+        last = u[k]
+        is_row = row < rows.size and rows[row] == k
+        for i in range(thresholds.size):
+            now, _, kept = _play(held[i], u[k], thresholds[i], creep, rate * step_s[k], even)
+            slope = kept * slopes[i] - (1.0 - kept) * (1.0 if u[k] > held[i] else -1.0)
+            held[i], slopes[i] = now, 0.0 if now == u[k] else slope
+            if is_row:
+                out[i, row], by[i, row] = held[i], slopes[i]
+        row += is_row
 
 
 @kernel(inline=True)

@@ -40,6 +40,7 @@ k]; lowest y, distance of nodes of y, half the band's width b, distance of nodes
 _BEFORE_POLE = 0.9
 _STEPS = 100
 _MOST_STEPS = 1000  # of y in a sample; the rest of a jump goes by the slope that it begins with
+_SMALLEST_SCALE = 1e-100
 _NEAR_UM = 1e-9
 
 
@@ -124,7 +125,7 @@ def duhem_columns(
     may be 0.
     """
     slopes, steps, lines, grid = band
-    by_node = np.zeros(out.shape[1])
+    by_node, scale = np.zeros(out.shape[1]), 1.0  # the derivatives are their product
     row = 0
     for k in range(y.size):
         last, field = y[k - 1] if k else start_y, w[k - 1] if k else start_w
@@ -149,12 +150,14 @@ def duhem_columns(
                 inside = 1.0 if field == free else 0.0  # the edge of the band forgets
                 gain = -inside * dy / half[0] ** 2
                 to_half = -0.5 * dy / first[0] ** 2
-                by_node *= inside + gain * half[1] * (1.0 + to_half * first[1])
-                _share_out(gain, way, half, slopes, by_node)
-                _share_out(gain * half[1] * to_half, way, first, slopes, by_node)
+                scale *= inside + gain * half[1] * (1.0 + to_half * first[1])
+                if abs(scale) < _SMALLEST_SCALE:
+                    by_node, scale = scale * by_node, 1.0
+                _share_out(gain / scale, way, half, slopes, by_node)
+                _share_out(gain / scale * half[1] * to_half, way, first, slopes, by_node)
         w[k] = field
         if row < rows.size and rows[row] == k:
-            out[row] = by_node
+            out[row] = scale * by_node
             row += 1
 
 

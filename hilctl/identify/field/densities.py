@@ -16,7 +16,7 @@ from scipy.optimize import nnls
 from hilctl.base.types import F64, I64
 from hilctl.identify.field.design_matrix import needed_points, play_columns, plays_given
 from hilctl.identify.least_squares import RIDGE, SearchPoint, differences
-from hilctl.kernels.field import drag_columns, play_path
+from hilctl.kernels.field import drag_columns, play_paths
 
 STEEPEST = 6.0  # maximum slope of the curve, of its mean
 SMOOTH = 0.01  # weight of a difference of neighbours, relative to the longest column
@@ -119,12 +119,9 @@ def _plays(
     u, rows = needed if creep is None else whole
     steps_s = np.zeros(u.size) if creep is None else creep.steps_s[k]
     width, rate = (0.0, 0.0) if creep is None else (creep.width, creep.rate / creep.width)
-    both = np.empty((2, grid.thresholds.size, rows.size))
-    at, by = np.empty(u.size), np.empty(u.size)
-    for i, threshold in enumerate(grid.thresholds):
-        play_path(u, steps_s, threshold, width, rate, at, by)
-        both[:, i] = at[rows], by[rows]
-    return both[0], both[1]
+    held, by = np.empty((2, grid.thresholds.size, rows.size))
+    play_paths(u, steps_s, grid.thresholds, width, rate, rows, held, by)
+    return held, by
 
 
 def outputs(
@@ -181,10 +178,14 @@ class Equations:
         self._lows = np.zeros(self._left.shape[1])
         self._lows[: grid.cells] = least
         self._lows[self._left.shape[1] - self._others.size :] = 1.0 / STEEPEST
-        longest = float(np.linalg.norm(columns * scale[:, None], axis=0).max())
+        longest = float(np.sqrt((scale**2 @ columns**2).max()))
         held = CURVE_SMOOTH * float(np.ptp(y)) / grid.knots * float(np.linalg.norm(scale))
         curve = self._others, anchor, self._share, held
         self._prior, self._wanted = _prior(self._used, grid, longest, curve)
+        self._centred = (self._left - self._means(self._left)) * scale[:, None]
+        normal = self._centred.T @ self._centred + self._prior.T @ self._prior
+        normal[np.diag_indices_from(normal)] += 1e-12 * float(normal.diagonal().max())
+        self._normal = normal
 
     def solve(self) -> Weights:
         """Return all weights; they are computed once."""
@@ -196,32 +197,27 @@ class Equations:
         curve_slopes[self._anchor] = max(rest, 1.0 / STEEPEST)
         slopes = np.zeros(self._used.size)
         slopes[self._used] = found[: found.size - others.size]
-        errors = (self._left @ found + constant - self._target) / (
-            curve_slopes[np.clip(np.searchsorted(self._knots, self._y) - 1, 0, grid.knots - 1)]
-        )
+        misfit = self._left @ found + constant - self._target
+        piece = np.clip(np.searchsorted(self._knots, self._y) - 1, 0, grid.knots - 1)
         values = np.concatenate(([0.0], np.cumsum(curve_slopes * np.diff(self._knots))))
         operators = values - constant  # 0 at rest
         offset_um = float(Curve(self._knots, operators).operators_of(np.zeros(1))[0])
         curve = Curve(operators, self._knots - offset_um)
-        residual = (self._left @ found + constant - self._target) * self._scale
+        residual = misfit * self._scale
         held = self._prior @ found - self._wanted
         squares = float(residual @ residual + held @ held)
         lines = slopes.reshape(grid.lines, grid.cells)
-        return Weights(lines, curve, offset_um, errors, squares)
+        return Weights(lines, curve, offset_um, misfit / curve_slopes[piece], squares)
 
     def place(self, errors: F64, changes: F64) -> SearchPoint:
         """Return the sum of squares with derivatives by the changes (Kaufman's approximation)."""
         # errors float64[N] and changes float64[N, p] are of outputs with the weights of solve().
         found, _ = self._found
         free = found > self._lows
-        means = self._means(self._left[:, free])
-        left = (self._left[:, free] - means) * self._scale[:, None]
-        rows = self._prior[:, free]
-        normal = left.T @ left + rows.T @ rows
-        corner = cholesky(normal + 1e-12 * float(normal.diagonal().max()) * np.eye(len(normal)))
+        corner = cholesky(self._normal[np.ix_(free, free)])
         here = errors * self._scale
         moved = (changes - self._means(changes)) * self._scale[:, None]
-        taken = solve_triangular(corner, left.T @ moved, trans=1)
+        taken = solve_triangular(corner, (self._centred.T @ moved)[free], trans=1)
         held = self._prior @ found - self._wanted
         squares = float(here @ here + held @ held)
         return SearchPoint(squares, moved.T @ here, moved.T @ moved - taken.T @ taken)
@@ -230,19 +226,16 @@ class Equations:
     def _found(self) -> tuple[F64, float]:
         """Minimise |scale (left w + c - target)|^2 + |prior w - wanted|^2 over w >= lows, and c."""
         # By normal equations, which are fast, and well conditioned because of the prior.
-        means, mean = self._means(self._left), float(self._means(self._target))
-        left = (self._left - means) * self._scale[:, None]
-        right = (self._target - mean - (self._left - means) @ self._lows) * self._scale
+        mean = float(self._means(self._target))
+        right = (self._target - mean) * self._scale - self._centred @ self._lows
+        corner = cholesky(self._normal)
         rows = self._prior
-        normal = left.T @ left + rows.T @ rows
-        normal[np.diag_indices_from(normal)] += 1e-12 * float(normal.diagonal().max())
-        corner = cholesky(normal)
-        downhill = left.T @ right + rows.T @ (self._wanted - rows @ self._lows)
+        downhill = self._centred.T @ right + rows.T @ (self._wanted - rows @ self._lows)
         more, _ = nnls(
             corner, solve_triangular(corner, downhill, trans=1), maxiter=100 * downhill.size
         )
         found = self._lows + more
-        return found, mean - float(means @ found)
+        return found, mean - float(self._means(self._left) @ found)
 
     def _means(self, rows: F64) -> F64:
         weight = self._scale**2 / float(np.sum(self._scale**2))

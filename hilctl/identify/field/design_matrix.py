@@ -84,24 +84,6 @@ def turning_points(u: F64, distance: float, turn: float, out: I64) -> int:
     return count
 
 
-@kernel()
-def swings(y: F64, turn: float, out: F64) -> None:
-    """Fill in the swing between turns of more than ``turn`` around each sample: float64[n]."""
-    first = last = 0  # the last turn, and the furthest sample since
-    way = 0.0
-    for k in range(y.size):
-        forth = (y[k] - y[last]) * way
-        if way == 0.0 and abs(y[k] - y[0]) > turn:
-            way = math.copysign(1.0, y[k] - y[0])
-            last = k
-        elif forth > 0.0:
-            last = k
-        elif forth < -turn:
-            out[first:last] = abs(y[last] - y[first])
-            first, last, way = last, k, -way
-    out[first:] = abs(y[last] - y[first])
-
-
 @kernel(nogil=True)
 def needed_points(u: F64, rows: I64, points: I64, places: I64) -> int:
     """Fill in rows and turns, and the place of each row among them; return their number."""
@@ -222,8 +204,10 @@ class Motion:
     ) -> "Motion":
         """Return the motion of a command and a displacement in um, float64[n] each."""
         command, displacement_um = signals
-        swing = np.empty(command.size)
-        swings(np.ascontiguousarray(displacement_um), TURN * stroke_um, swing)
+        y, points = np.ascontiguousarray(displacement_um), np.empty(command.size, dtype=np.int64)
+        turns = points[: turning_points(y, math.inf, TURN * stroke_um, points)]
+        swing = np.repeat(np.abs(np.diff(y[turns])), np.diff(turns))
+        swing = np.append(swing, swing[-1])
         travel = np.abs(np.diff(command, prepend=command[:1])) / (2.0 * reach)
         return cls(travel, step_s, np.maximum(swing / stroke_um, LEAST_SWING), judged)
 

@@ -13,7 +13,7 @@ from hilctl.kernels.field import (
     field_left,
     lost_field,
     mapped,
-    play_path,
+    play_paths,
 )
 from hilctl.kernels.hysteresis import rest_memory
 
@@ -118,9 +118,10 @@ def test_model_and_inverse_are_the_equations(coupling, losses):
 
 
 def play_along(u, threshold=0.8, creep=CREEP, pace=PACE):
-    out, by = np.empty_like(u), np.empty_like(u)
-    play_path(u, np.ones(u.size), threshold, creep, pace, out, by)
-    return out, by
+    out, by = np.empty((2, 1, u.size))
+    rows = np.arange(u.size)
+    play_paths(u, np.ones(u.size), np.array([threshold]), creep, pace, rows, out, by)
+    return out[0], by[0]
 
 
 def test_a_play_that_creeps_follows_its_equation():
