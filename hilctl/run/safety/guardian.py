@@ -41,7 +41,7 @@ from hilctl.run.shared.shared_page import (
     SharedPage,
 )
 
-_POLLS = 3
+_LONGEST_POLL_NS = 10_000_000
 _CLOSING_S = 30.0
 _POLL_MS = 5
 LAST_CALL_MS = 5
@@ -54,8 +54,8 @@ Its memory is released much later, which only matters to a device that accepts o
 class HangWatch:
     """Detect a live loop without heartbeat.
 
-    A stall of the whole computer stalls this process too, so silence counts only after several
-    polls.
+    A stall of the whole computer stalls this process too, so the time between two polls counts only
+    up to :data:`_LONGEST_POLL_NS`.
     """
 
     def __init__(
@@ -65,21 +65,19 @@ class HangWatch:
         self._limits = limits
         self._is_stopped = is_stopped
         self._heartbeat_ns = -1
-        self._seen_ns = 0
-        self._polls = 0
+        self._polled_ns = self._silent_ns = 0
 
     def hangs(self, now_ns: int) -> bool:
         """Poll once; return whether the loop has been silent for too long."""
         page = self._page
         heartbeat_ns, phase = page.get(PageField.LOOP_HEARTBEAT_NS), page.get(PageField.PHASE)
         watched = phase in {Phase.RUNNING, Phase.CLOSING, Phase.ENDED, Phase.FAILED}
+        passed_ns, self._polled_ns = now_ns - self._polled_ns, now_ns
         if heartbeat_ns != self._heartbeat_ns or not watched:
-            self._heartbeat_ns, self._seen_ns, self._polls = heartbeat_ns, now_ns, 0
+            self._heartbeat_ns, self._silent_ns = heartbeat_ns, 0
             return False
-        self._polls += 1
-        silent_s = (now_ns - self._seen_ns) * 1e-9
-        if self._polls <= _POLLS:
-            return False
+        self._silent_ns += min(passed_ns, _LONGEST_POLL_NS)
+        silent_s = self._silent_ns * 1e-9
         limits = self._limits
         loop_s = limits.real_time_s if page.get(PageField.REAL_TIME) else limits.ordinary_s
         beats = phase in {Phase.RUNNING, Phase.CLOSING}
