@@ -90,7 +90,7 @@ def verdict_of(
             "no data were held out: use four loops or more at several amplitudes and frequencies, "
             "or other files with --validate"
         )
-    if grade_of(classes) == "poor" and (cause := _cause(fit, records, settings)):
+    if grade_of(classes) != "good" and (cause := _cause(fit, records, settings)):
         notes.insert(0, cause)
     grade = grade_of(classes, known=known and held_out is not None)
     return verdict(grade, notes=(*notes, *suggestions))

@@ -88,6 +88,13 @@ def test_what_a_campaign_can_t_know_is_said_and_nothing_is_good(grid, chosen, no
     assert any(note in each for each in verdict.notes)
 
 
+def test_the_cause_of_an_error_is_named_before_a_model_is_poor(grid):
+    clipped = changed(grid, lambda y: np.minimum(y, 29.2))
+    verdict = judged(clipped).verdict
+    assert verdict.grade == "usable"
+    assert "end of its range" in verdict.notes[0]
+
+
 def test_drift_that_a_model_of_decaying_motions_hides_is_named():
     time_s = np.arange(20_000) / 1000.0
     command = (6.0 - 0.27 * time_s) * np.sin(2.0 * np.pi * time_s)
