@@ -85,8 +85,10 @@ class SafetyMonitor:
             self._keep_guardian(now_ns)
 
     def _in_trouble(self, now_ns: int, *, ended: bool) -> bool:
+        hung = not ended and self._watch.hangs(now_ns)
+        if self._hung and not hung and not ended and self._reached()[1] is None:
+            self._trouble_ns, self._hung = 0, False  # the loop continues, and no process has acted
         if not self._trouble_ns:
-            hung = not ended and self._watch.hangs(now_ns)
             if hung and self._page.ended_safely():
                 self._child.kill(0.0)
             elif hung or (ended and not self._page.ended_safely()):

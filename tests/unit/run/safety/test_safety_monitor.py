@@ -244,6 +244,17 @@ def test_a_hanging_loop_is_found_here_too(run):
     assert run.log == ["guardian killed", "loop killed", "safe 0.25"]
 
 
+def test_a_loop_that_continues_before_any_process_acts_is_left_alone(run, page):
+    for _ in range(50):
+        run.look()
+    for _ in range(600):
+        page.put(PageField.LOOP_HEARTBEAT_NS, run.now_ns)
+        run.look()
+    run.look_alive(page, passed_ms=60)
+    assert run.log == []
+    assert run.safety.result is None
+
+
 def test_a_guardian_is_awake_for_50_ms_after_its_heartbeat(run):
     run.look(ended=True)
     run.look(ended=True, passed_ms=50 - 1e-6, awake=False)
