@@ -15,7 +15,7 @@ import re
 from abc import ABC, abstractmethod
 from array import array
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Collection, Iterator, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -155,14 +155,13 @@ class Table(ABC):
         """Return a column's base unit (s, um, A or V; empty if unknown) and its factor to it."""
         return known_unit(self._units[index]) or ("", 1.0)
 
-    def only(self, usual: str, *units: str) -> int | None:
-        """Return the index of the column with the usual name, or the only one in one of the units.
+    def only(self, usual: Collection[str], *units: str) -> int | None:
+        """Return the index of the column with a usual name, or the only one in one of the units.
 
         Units are base units (s, um, A, V). Return None if there is no such column, or several.
         """
-        if usual in self.names:
-            return self.index(usual)
-        found = [each for each in range(len(self.names)) if self.unit(each)[0] in units]
+        named = [at for at, name in enumerate(self.names) if name in usual]
+        found = named or [at for at in range(len(self.names)) if self.unit(at)[0] in units]
         return found[0] if len(found) == 1 else None
 
     @abstractmethod

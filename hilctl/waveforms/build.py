@@ -85,7 +85,7 @@ def _read(w: spec.FileWaveform, path: Path) -> tuple[F64, float | None]:
         table: Table = ArrayTable(path, columns)
     else:
         table, own_rate_hz = open_table(path), None
-    at, time = table.index(w.column), table.only("t_s", "s")
+    at, time = table.index(w.column), table.only({"t_s"}, "s")
     base, factor = table.unit(at)
     rows = table.read([at] if time is None else [at, time], w.first_row, w.last_row)
     count = rows.lines.size

@@ -14,7 +14,8 @@ MOST_UM = 5000.0
 APART = 30.0  # maximum ratio of the gains of records of one actuator
 SLOW = 1.5  # of the lowest frequency: loops whose phase is due to hysteresis, not delay
 SPIKE = 20.0  # ratio of a spike to what 99 % of the samples differ from their neighbours
-SPIKE_STROKE = 0.1  # smallest spike, of the stroke of all other samples
+KINK = 2.0  # smallest ratio of a spike to the steps of the samples beside it
+SPIKE_STROKE = 0.02  # smallest spike or step, of the stroke of all other samples
 JUMP = 0.05  # of the command's range: a step of the command is no fault
 CLIPPED, FEWEST_CLIPPED = 0.05, 5  # motion of the command, of its range, and samples at one value
 LARGE = 0.1  # of the largest swing: smaller ones are ignored
@@ -77,10 +78,15 @@ def _jump(record: Record, settings: FitSettings) -> str:
     others_um = float(np.ptp(np.delete(y, at)))
     size_um = abs(stays_um) if is_step else off[at - 1]
     usual_um = float(np.percentile(off, 99.0))
-    if off[at - 1] <= SPIKE * usual_um or size_um <= SPIKE_STROKE * others_um:
+    # At a kink of the displacement, the samples beside it differ as much.
+    beside_um = max(np.ptp(y[max(at - 2, 0) : at]), np.ptp(y[at + 1 : at + 3]))
+    least_um = max(SPIKE * usual_um, KINK * beside_um)
+    if off[at - 1] <= least_um or size_um <= SPIKE_STROKE * others_um:
         return ""
     if not is_step:
-        return f"has a spike of {y[at]:.4g} µm at {_place(record, settings, at)}: remove it"
+        in_table = isinstance(record, History) and _first_row(record, settings) is not None
+        cure = "remove the value (NaN or an empty cell)" if in_table else "measure again"
+        return f"has a spike of {y[at]:.4g} µm at {_place(record, settings, at)}: {cure}"
     if abs(u[at + 1] - u[at - 1]) > JUMP * np.ptp(u):
         return ""
     at += abs(y[at + 1] - y[at]) > abs(y[at] - y[at - 1])  # the first sample after the step

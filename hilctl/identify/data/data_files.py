@@ -1,7 +1,7 @@
 """Records of an identification, read from recordings and text tables."""
 
 import logging
-from collections.abc import Iterable, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from dataclasses import replace
 from itertools import chain
 from pathlib import Path
@@ -95,13 +95,15 @@ def _columns(table: Table, settings: TableSettings) -> list[int]:
     """
     named, shown = settings.command_column, settings.displacement_column
     found = {
-        "--command-column": _column(table, named, "--command-column", "current_a", "A", "V"),
+        "--command-column": _column(
+            table, named, "--command-column", {"current_a", "drive_v"}, "A", "V"
+        ),
         "--displacement-column": _column(
-            table, shown, "--displacement-column", "displacement_um", "um"
+            table, shown, "--displacement-column", {"displacement_um"}, "um"
         ),
     }
     if settings.rate_hz is None:
-        time = _column(table, settings.time_column, "--time-column", "t_s", "s")
+        time = _column(table, settings.time_column, "--time-column", {"t_s"}, "s")
         found["--time-column or --rate-hz"] = time
     elif settings.time_column is not None:
         raise DataError(f"{table.path}: set either --time-column or --rate-hz (got both)")
@@ -117,7 +119,7 @@ def _columns(table: Table, settings: TableSettings) -> list[int]:
 
 
 def _column(
-    table: Table, column: Column | None, option: str, usual: str, *units: str
+    table: Table, column: Column | None, option: str, usual: Collection[str], *units: str
 ) -> int | None:
     if column is None:
         return table.only(usual, *units)

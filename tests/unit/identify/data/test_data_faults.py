@@ -62,6 +62,15 @@ def test_other_faults(displacement_um, said):
     assert said in fault(displacement_um)
 
 
+def test_a_small_spike_is_named_with_a_cure_that_works():
+    displacement_um = MOVES.copy()
+    displacement_um[777] += 0.04 * np.ptp(MOVES)
+    found = fault(displacement_um)
+    assert "(row 778)" in found
+    assert "NaN" in found
+    assert "NaN" not in fault(displacement_um, label="run.mcap")
+
+
 def test_a_step_of_the_command_is_no_fault():
     command = np.where(TIME_S < 3.0, 0.0, 4.0) + 0.1 * np.sin(12.0 * TIME_S)
     history = History("h.csv", command, 4.0 * command + NOISE, 500.0)

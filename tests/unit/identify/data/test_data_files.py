@@ -247,7 +247,8 @@ def test_columns_are_known_by_their_units(tmp_path):
     np.testing.assert_allclose(history.command, 3e-3 * np.arange(20))
     np.testing.assert_allclose(history.displacement_um, 2e-3 * np.arange(20))
     assert history.sample_rate_hz == pytest.approx(2e5)
-    assert read("t_s,wanted_a,displacement_um,current_a").command[-1] == 57.0
+    for unit, name in (("a", "current_a"), ("v", "drive_v")):
+        assert read(f"t_s,wanted_{unit},displacement_um,{name}").command[-1] == 57.0
     with pytest.raises(DataError) as caught:
         read("x,CH1,CH2,CH3")
     for option in ("--time-column", "--rate-hz", "--command-column", "--displacement-column"):
