@@ -42,6 +42,7 @@ from hilctl.experiment.device_state import (
     left_by_last_run,
     rests_at,
 )
+from hilctl.experiment.file import Experiment
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_validity import ExpectedError, RangeFindings, range_findings
@@ -303,17 +304,20 @@ def reference_problems(
         if excess > 0.0:
             rule = f"reference must stay within {name}, {lowest:g} to {highest:g} µm"
             value = f"{low:.6g} to {high:.6g} µm"
-            hint = f"{excess:.3g} µm too far: {_fitting(low, high, lowest, highest)}"
+            cure = _fitting(config, (low, high), lowest, highest)
+            hint = f"{excess:.3g} µm too far: {cure}"
             found.append(loaded.problem("waveform", rule, value, hint))
     return found
 
 
-def _fitting(low: float, high: float, lowest: float, highest: float) -> str:
-    """Return the changes with which a waveform from ``low`` to ``high`` keeps to a range."""
+def _fitting(config: Experiment, span: tuple[float, float], lowest: float, highest: float) -> str:
+    """Return the changes with which a waveform with this span keeps to a range."""
+    low, high = span
     fits, centred = high - low <= highest - lowest, lowest <= 0.5 * low + 0.5 * high <= highest
+    size = "scale" if config.waveform.kind == "file" else "amplitude"
     if fits:
-        return f"change the waveform's {'amplitude or offset' if centred else 'offset'}"
-    return f"lower the waveform's amplitude{'' if centred else ', and change its offset'}"
+        return f"change the waveform's {f'{size} or offset' if centred else 'offset'}"
+    return f"lower the waveform's {size}{'' if centred else ', and change its offset'}"
 
 
 def command_problems(
@@ -336,7 +340,8 @@ def command_problems(
         below = low - forecast.command_min == excess
         at_s = forecast.lowest_at_s if below else forecast.highest_at_s
         place, cure = _place(loaded, reference, forecast, at_s)
-        fitting = _fitting(forecast.command_min, forecast.command_max, low, high)
+        spanned = forecast.command_min, forecast.command_max
+        fitting = _fitting(loaded.config, spanned, low, high)
         cure = cure or _smaller(loaded, forecast, excess) or fitting
         cure += f", or {_wider(loaded, forecast)}"
         rule = f"the run must stay within {low:g} to {high:g} {unit}"

@@ -240,6 +240,18 @@ def test_what_a_message_advises_passes_the_check(text, settings, given, advised,
         checked(text, *settings, *cure, *instead, **given)
 
 
+def test_a_file_that_is_too_large_is_cured_by_its_scale(tmp_path):
+    path = tmp_path / "reference.csv"
+    path.write_text(
+        "reference\n" + "\n".join(f"{10.0 * np.sin(2e-3 * np.pi * k):.6f}" for k in range(1000))
+    )
+    waveform = f"waveform={{kind: file, path: {path}, unit: A, file_rate_hz: 10000.0}}"
+    settings, model = (waveform, "limits.stroke_um=[-9.0, 9.0]"), terfenol_rdpi()
+    (found,) = refusals(DISPLACEMENT, *settings, model=model)
+    assert "scale" in found.hint
+    checked(DISPLACEMENT, *settings, "waveform.scale=0.85", model=model)
+
+
 @pytest.mark.parametrize(("bandwidth", "gain"), [("", 1.0), (", bandwidth_hz: 10.0", 0.5**0.5)])
 def test_voltage_is_that_of_resistance_and_inductance(bandwidth, gain):
     """A current loop with its corner at the frequency of a sine leaves 0.71 of the amplitude."""
