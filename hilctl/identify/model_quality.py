@@ -1,5 +1,6 @@
 """Grade of a model: good, usable within an error, poor, or not a model, with reasons."""
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass
 from functools import partial
@@ -26,7 +27,8 @@ EVEN = 0.5  # correlation with the command's distance from its middle
 LIKELY_UM = 500.0
 ALIKE = 1.2  # ratio of amplitudes or frequencies that count as one
 CONSTANT = 0.5  # part of the mean square error that is a constant, or is not a drift
-DRIFT, FEWEST_TURNS = 0.05, 6  # smallest drift, of the stroke, and turns that show it
+NOISY = 0.7  # part of the mean square error that is noise
+DRIFT, FEWEST_TURNS = 0.02, 6  # smallest drift, of the stroke, and turns that show it
 CLEAR_PERCENT = 0.5
 
 
@@ -122,9 +124,21 @@ def _fit_reasons(
 def _cause(fit: FittedModel, records: Sequence[Record], settings: FitSettings) -> str:
     """Return the fault of a record that explains a large error; empty if none is known."""
     for i, record in enumerate(records):
-        if text := record_fault(record, settings) or _drift(_error_um(fit, i, record), record):
+        error_um = _error_um(fit, i, record)
+        if text := record_fault(record, settings) or _drift(error_um, record) or _noise(error_um):
             return f"'{record.label}' {text}"
     return ""
+
+
+def _noise(error_um: F64) -> str:
+    """Return that most of an error is noise, which has no relation from sample to sample."""
+    noise_um2 = 0.5 * float(np.var(np.diff(error_um)))
+    if noise_um2 < NOISY * float(error_um.var()):
+        return ""
+    return (
+        f"has noise of {math.sqrt(noise_um2):.2g} µm rms, which is most of its error: the model "
+        "may be better; measure again with less noise"
+    )
 
 
 def _drift(error_um: F64, record: Record) -> str:

@@ -103,6 +103,16 @@ def test_drift_that_a_model_of_decaying_motions_hides_is_named():
     assert any("drifts by" in text for text in (*verdict.reasons, *verdict.notes)), verdict
 
 
+def test_noise_is_named_as_the_cause_of_an_error():
+    time_s = np.arange(20_000) / 1000.0
+    command = (6.0 - 0.27 * time_s) * np.sin(2.0 * np.pi * time_s)
+    noise_um = 0.5 * np.random.default_rng(5).standard_normal(time_s.size)
+    noisy_um = TRUTH.forward(1000.0).process(command) + noise_um
+    verdict = judged([History("decay", command, noisy_um, 1000.0)]).verdict
+    assert verdict.grade == "poor"
+    assert "noise of 0.5 µm rms" in verdict.notes[0]
+
+
 def test_turns_at_equal_distances_from_0_tell_drift_too():
     time_s = np.arange(20_000) / 1000.0
     command = 6.0 * np.round(np.sin(2.0 * np.pi * time_s), 3)
