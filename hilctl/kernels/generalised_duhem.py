@@ -40,7 +40,7 @@ k]; lowest y, distance of nodes of y, half the band's width b, distance of nodes
 _BEFORE_POLE = 0.9
 _STEPS = 100
 _MOST_STEPS = 1000  # of y in a sample; the rest of a jump goes by the slope that it begins with
-_SMALLEST_SCALE = 1e-100
+_SMALLEST_SCALE = 1e-100  # of the factor that derivatives share; a smaller one may become 0
 _NEAR_UM = 1e-9
 
 
