@@ -123,9 +123,12 @@ def _fit_reasons(
 
 def _cause(fit: FittedModel, records: Sequence[Record], settings: FitSettings) -> str:
     """Return the fault of a record that explains a large error; empty if none is known."""
-    for i, record in enumerate(records):
-        error_um = _error_um(fit, i, record)
-        if text := record_fault(record, settings) or _drift(error_um, record) or _noise(error_um):
+    pairs = [(record, _error_um(fit, i, record)) for i, record in enumerate(records)]
+    for record, error_um in pairs:
+        if text := record_fault(record, settings) or _drift(error_um, record):
+            return f"'{record.label}' {text}"
+    for record, error_um in pairs:  # all may have noise, and one of them a fault
+        if text := _noise(error_um):
             return f"'{record.label}' {text}"
     return ""
 
