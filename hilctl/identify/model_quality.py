@@ -136,7 +136,7 @@ def _cause(fit: FittedModel, records: Sequence[Record], settings: FitSettings) -
 def _noise(error_um: F64) -> str:
     """Return that most of an error is noise, which has no relation from sample to sample."""
     noise_um2 = 0.5 * float(np.var(np.diff(error_um)))
-    if noise_um2 < NOISY * float(error_um.var()):
+    if noise_um2 <= NOISY * float(error_um.var()):
         return ""
     return (
         f"has noise of {math.sqrt(noise_um2):.2g} µm rms, which is most of its error: the model "
