@@ -92,7 +92,8 @@ def verdict_of(
             "no data were held out: use four loops or more at several amplitudes and frequencies, "
             "or other files with --validate"
         )
-    if grade_of(classes) != "good" and (cause := _cause(fit, records, settings)):
+    found = grade_of(classes)
+    if found != "good" and (cause := _cause(fit, records, settings, hidden=found == "poor")):
         notes.insert(0, cause)
     grade = grade_of(classes, known=known and held_out is not None)
     return verdict(grade, notes=(*notes, *suggestions))
@@ -121,11 +122,16 @@ def _fit_reasons(
         )
 
 
-def _cause(fit: FittedModel, records: Sequence[Record], settings: FitSettings) -> str:
-    """Return the fault of a record that explains a large error; empty if none is known."""
+def _cause(
+    fit: FittedModel, records: Sequence[Record], settings: FitSettings, *, hidden: bool = True
+) -> str:
+    """Return the fault of a record that explains a large error; empty if none is known.
+
+    A drift may be ``hidden`` by the model, so that its error does not show it.
+    """
     pairs = [(record, _error_um(fit, i, record)) for i, record in enumerate(records)]
     for record, error_um in pairs:
-        if text := record_fault(record, settings) or _drift(error_um, record):
+        if text := record_fault(record, settings) or _drift(error_um, record, hidden=hidden):
             return f"'{record.label}' {text}"
     for record, error_um in pairs:  # all may have noise, and one of them a fault
         if text := _noise(error_um):
@@ -144,19 +150,20 @@ def _noise(error_um: F64) -> str:
     )
 
 
-def _drift(error_um: F64, record: Record) -> str:
+def _drift(error_um: F64, record: Record, *, hidden: bool) -> str:
     """Return that most of the error in a history is a linear drift of the displacement."""
     if isinstance(record, SteadyLoop):
         return ""
     first = record.command.size - error_um.size
     turns = turning_points(record.command[first:])
-    # A model of decaying motions hides drift, which the middles of their swings show.
+    # A model of decaying motions hides drift, which the middles of their swings show. These also
+    # move with the amplitude if the actuator is asymmetric.
     times_s, middles, middles_um = (
         0.5 * (each[first:][turns][1:] + each[first:][turns][:-1])
         for each in (record.time_s, record.command, record.displacement_um)
     )
     signals = [(record.time_s[first:], -error_um)]
-    if turns.size > FEWEST_TURNS:
+    if hidden and turns.size > FEWEST_TURNS:
         line = np.stack((middles, np.ones_like(middles)), axis=1)
         straight = line @ np.linalg.lstsq(line, middles_um)[0]
         signals.append((times_s, middles_um - straight))

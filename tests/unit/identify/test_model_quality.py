@@ -117,7 +117,16 @@ def test_turns_at_equal_distances_from_0_tell_drift_too():
     time_s = np.arange(20_000) / 1000.0
     command = 6.0 * np.round(np.sin(2.0 * np.pi * time_s), 3)
     record = History("even", command, 5.0 * command + 0.4 * time_s, 1000.0)
-    assert "drifts by about 0.4 " in model_quality._drift(np.tile([1.0, -1.0], 10_000), record)
+    assert "drifts by about 0.4 " in model_quality._drift(
+        np.tile([1.0, -1.0], 10_000), record, hidden=True
+    )
+
+
+def test_middles_that_move_with_the_amplitude_are_no_drift_of_a_usable_model():
+    time_s = np.arange(20_000) / 1000.0
+    command = (6.0 - 0.27 * time_s) * np.sin(2.0 * np.pi * time_s)
+    record = History("even", command, 5.0 * command + 0.3 * command**2, 1000.0)
+    assert model_quality._drift(np.tile([1.0, -1.0], 10_000), record, hidden=False) == ""
 
 
 def test_an_offset_is_suggested_where_the_error_is_one(grid):
