@@ -129,24 +129,21 @@ def _cause(
 
     A drift may be ``hidden`` by the model, so that its error does not show it.
     """
-    pairs = [(record, _error_um(fit, i, record)) for i, record in enumerate(records)]
-    for record, error_um in pairs:
+    errors_um = [_error_um(fit, i, record) for i, record in enumerate(records)]
+    for error_um, record in zip(errors_um, records, strict=True):
         if text := record_fault(record, settings) or _drift(error_um, record, hidden=hidden):
             return f"'{record.label}' {text}"
-    for record, error_um in pairs:  # all may have noise, and one of them a fault
-        if text := _noise(error_um):
-            return f"'{record.label}' {text}"
-    return ""
+    return _noise(errors_um)
 
 
-def _noise(error_um: F64) -> str:
-    """Return that most of an error is noise, which has no relation from sample to sample."""
-    noise_um2 = 0.5 * float(np.var(np.diff(error_um)))
-    if noise_um2 <= NOISY * float(error_um.var()):
+def _noise(errors_um: Sequence[F64]) -> str:
+    """Return that most of the error is noise, which has no relation from sample to sample."""
+    noise_um2 = 0.5 * float(np.var(np.concatenate([np.diff(each) for each in errors_um])))
+    if noise_um2 <= NOISY * float(np.concatenate(errors_um).var()):
         return ""
     return (
-        f"has noise of {math.sqrt(noise_um2):.2g} µm rms, which is most of its error: the model "
-        "may be better; measure again with less noise"
+        f"most of the error is sensor noise, {math.sqrt(noise_um2):.2g} µm rms: the "
+        "model may be better; measure again with less noise"
     )
 
 

@@ -110,7 +110,14 @@ def test_noise_is_named_as_the_cause_of_an_error():
     noisy_um = TRUTH.forward(1000.0).process(command) + noise_um
     verdict = judged([History("decay", command, noisy_um, 1000.0)]).verdict
     assert verdict.grade == "poor"
-    assert "noise of 0.5 µm rms" in verdict.notes[0]
+    assert "sensor noise, 0.5 µm rms" in verdict.notes[0]
+
+
+def test_noise_of_one_record_does_not_explain_the_error_of_others():
+    noise_um = np.random.default_rng(5).standard_normal(1000)
+    smooth_um = np.sin(np.arange(1000) / 50.0)
+    assert model_quality._noise([noise_um, 0.3 * smooth_um])
+    assert not model_quality._noise([noise_um, 3.0 * smooth_um])
 
 
 def test_turns_at_equal_distances_from_0_tell_drift_too():
