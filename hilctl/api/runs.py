@@ -116,6 +116,7 @@ def run(
     settings: Settings = (),
     fast: bool = False,
     overwrite: bool = False,
+    take_over: bool = False,
     on_progress: Callable[[Progress], None] = lambda progress: None,
 ) -> RunResult:
     """Run an experiment and record it; SIGINT and SIGTERM ramp to the safe value first.
@@ -129,6 +130,7 @@ def run(
         settings: Overrides of the experiment.
         fast: Simulate without waiting; simulated devices only, any computer.
         overwrite: Replace an existing recording.
+        take_over: Use the device although another user's process has it.
         on_progress: Called with each batch of samples of a run in real time.
 
     Returns:
@@ -140,7 +142,7 @@ def run(
     """
     path, texts, chosen = Path(experiment), texts_of(settings), path_or_none(output)
     if not fast:
-        return start_run(path, texts, chosen, overwrite, on_progress)
+        return start_run(path, texts, chosen, overwrite, on_progress, take_over=take_over)
     from hilctl.run.unpaced import run_unpaced  # a supervisor does not need the loop
 
     checked = checked_experiment(path, texts)

@@ -86,6 +86,11 @@ def is_locked(held: int | IO[bytes]) -> bool:
         return True
     except OSError:
         return False
+    release_lock(held)
+    return False
+
+
+def release_lock(held: int | IO[bytes]) -> None:
+    """Unlock an open file or folder for all processes that share it."""
     if fcntl is not None:
         fcntl.flock(held, fcntl.LOCK_UN)
-    return False

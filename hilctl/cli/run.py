@@ -64,6 +64,10 @@ def run(
         bool,
         typer.Option("--require-rt", help="Refuse to run without SCHED_FIFO and locked memory."),
     ] = False,
+    take_over: Annotated[
+        bool,
+        typer.Option("--take-over", help="Use the device although another user's process has it."),
+    ] = False,
     as_json: AsJson = False,
 ) -> None:
     """Run an experiment and record it (Ctrl-C ramps to the safe value first)."""
@@ -75,7 +79,8 @@ def run(
     if detach and live:
         raise InputError("--detach excludes --live: use hilctl live after the start")
     if detach:
-        _detach(experiment, output, settings, overwrite=overwrite, as_json=as_json)
+        flags = ["--overwrite"] * overwrite + ["--take-over"] * take_over
+        _detach(experiment, output, settings, flags, as_json=as_json)
         return
     require_linux()
     # With stty tostop, output of a background job would stop the supervisor.
@@ -92,7 +97,7 @@ def run(
                 stack.enter_context(_watched())
             shown = run_progress(quiet=as_json or watch, addresses=addresses)
             result = api.run(
-                experiment, output, settings=settings, overwrite=overwrite,
+                experiment, output, settings=settings, overwrite=overwrite, take_over=take_over,
                 on_progress=stack.enter_context(shown),
             )  # fmt: skip
             if result.stop_signal:  # a second Ctrl-C must not suppress the result
@@ -133,12 +138,11 @@ def _watched() -> Iterator[None]:
 
 
 def _detach(
-    experiment: Path, output: Path | None, settings: list[str], *, overwrite: bool, as_json: bool
+    experiment: Path, output: Path | None, settings: list[str], flags: list[str], *, as_json: bool
 ) -> None:
     finding = log_out(Machine())
     if finding.level != "ok":
         _log.warning("a log-out %s: %s", finding.text, finding.remedy)
-    flags = ["--overwrite"] if overwrite else []
     started = start_detached(experiment, settings, output, flags)
     facts = {"recording": str(started.recording), "log": str(started.log)}
     if as_json:

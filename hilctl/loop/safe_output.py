@@ -24,17 +24,15 @@ OutputState: TypeAlias = Literal["confirmed", "set", "sent", "unknown"]
 
 Code: TypeAlias = Literal["completed", "stopped", "fault"]
 
-HOLD_S = 30.0
-"""How long the safe value is repeated after an unanswered command.
-
-A gateway queues requests, and its timeouts and retries add up: some take 10 s for one request.
-"""
 PATIENCE_S = 5.0
 """How long a command waits for confirmation before the guardian takes over."""
 _RAMP_S = 0.005
 _RETRY_S = 0.05
 _LATER_RETRY_S = 0.5
 _REPEAT_S = 0.2
+PATIENT_AFTER_S = 60.0
+"""How long the safe value is repeated quickly; then once per second."""
+_PATIENT_S = 1.0
 _SENDS = 5
 _OWN_ERRORS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS}
 
@@ -128,7 +126,6 @@ class SafeOutput:
         self._clock, self._on_write = clock, on_write
         self._pending = goal.pending
         self._began_s: float | None = None
-        self._held_since_s: float | None = None
         self._sends = 0
         self.pause_s = 0.0
         """Pause before the next attempt, s."""
@@ -148,7 +145,8 @@ class SafeOutput:
         now_s = self._clock()
         if self._began_s is None:
             self._began_s = now_s - _RAMP_S
-        value = self._value(now_s - self._began_s)
+        passed_s = now_s - self._began_s
+        value, least_s = self._value(passed_s), _PATIENT_S if passed_s > PATIENT_AFTER_S else 0.0
         confirmed = True
         self._on_write(value)
         try:
@@ -158,29 +156,20 @@ class SafeOutput:
         except DeviceError as error:
             if _is_local(error):
                 raise LocalError(str(error)) from error
-            patient = now_s - self._began_s > PATIENCE_S
-            self.pause_s = _LATER_RETRY_S if patient else _RETRY_S
             self.state, self.error = "unknown", str(error)
+            self.pause_s = _RETRY_S if passed_s <= PATIENCE_S else max(_LATER_RETRY_S, least_s)
             # The device may execute this command later, after the next one.
-            self._held_since_s = None
             self._pending |= value != self._goal.value
             return
         if value != self._goal.value:
             self.state, self.error, self.pause_s = "unknown", "on the safe ramp", _RAMP_S
             return
-        self.error, self.pause_s = "", _REPEAT_S
+        self.error, self.pause_s = "", max(_REPEAT_S, least_s)
         if confirmed:
-            self.state = self._held()
+            self.state = "set" if self._pending else "confirmed"
         else:
             self._sends += 1
             self.state = "sent"
-
-    def _held(self) -> OutputState:
-        now_s = self._clock()
-        if self._held_since_s is None:
-            self._held_since_s = now_s
-        held = now_s - self._held_since_s >= HOLD_S
-        return "confirmed" if held or not self._pending else "set"
 
     def _value(self, passed_s: float) -> float:
         goal = self._goal

@@ -49,6 +49,8 @@ class Job:
     files: Mapping[str, str]
     folder: str
     ring: str
+    holds: list[str]  # resources of the device, see DeviceInfo.holds
+    locks: list[int]  # descriptors of their locks, which the processes of the run inherit
     reference: str
     input_um: str
     state: list[float] | None
@@ -65,7 +67,13 @@ class Job:
 
     @classmethod
     def of(
-        cls, checked: "CheckedExperiment", folder: "RunFolder", *, supervisor: int, silence_s: float
+        cls,
+        checked: "CheckedExperiment",
+        folder: "RunFolder",
+        *,
+        locks: list[int],
+        supervisor: int,
+        silence_s: float,
     ) -> Self:
         """Return the job of a checked experiment, and write its arrays into the run's folder."""
         loaded, begun = checked.loaded, checked.begun
@@ -80,6 +88,8 @@ class Job:
             files=loaded.files.texts,
             folder=str(loaded.folder.absolute()),  # a link stays, as in the names of the texts
             ring=str(folder.ring),
+            holds=list(loaded.device.info.holds),
+            locks=locks,
             reference=str(reference),
             input_um=str(input_um),
             state=None if begun.state is None else begun.state.tolist(),

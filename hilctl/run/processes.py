@@ -9,11 +9,11 @@ import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
-from typing import Any
+from typing import Any, Literal
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.run.run_folder import RunFolder, locked_run, runs
-from hilctl.run.shared.ring import SampleRing, safe_result_of
+from hilctl.run.run_folder import GUARDIAN, DeviceLocks, RunFolder, runs
+from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase, SharedPage
 
 _log = logging.getLogger(__name__)
@@ -22,6 +22,7 @@ _READY_TIMEOUT_S = 120.0
 _DEATH_S = 0.1
 _END_S = 1.0
 _ACT_S = 10.0
+_CLOSE_S = 40.0  # in which a guardian ends its last write, and closes its device
 _POLL_S = 0.01
 
 
@@ -73,13 +74,21 @@ class LoopProcess(ChildProcess):
             raise RunError(f"cannot start the loop process: {error.strerror}") from None
         super().__init__(process)
 
-    def await_ready(self, stopped: Callable[[], bool]) -> None:
-        """Wait until it is ready; raise InputError or RunError otherwise: nothing has moved."""
+    def await_ready(
+        self, stopped: Callable[[], bool], acquire: Callable[[], object] = lambda: None
+    ) -> None:
+        """Wait until it is ready; raise InputError or RunError otherwise: nothing has moved.
+
+        ``acquire`` is called when it needs the device, which a guardian may keep until then.
+        """
         page = self._page
         deadline = time.monotonic() + _READY_TIMEOUT_S
         while page.observe(PageField.PHASE) == Phase.STARTING and not self.ended:
             if stopped():
                 raise RunError("stopped before the start; nothing has moved")
+            if page.observe(PageField.AWAITS_DEVICE) and not page.get(PageField.HAS_DEVICE):
+                acquire()
+                page.publish(PageField.HAS_DEVICE, 1)
             if time.monotonic() > deadline:
                 raise RunError(f"the loop was not ready within {_READY_TIMEOUT_S:g} s")
             time.sleep(_POLL_S)
@@ -107,11 +116,15 @@ class GuardianProcess(ChildProcess):
     """The guardian of one run; see :mod:`hilctl.run.safety.guardian`.
 
     Args:
-        loop: Process number of the loop to watch; None to act immediately.
+        loop: Process number of the loop to watch, or how to act without one.
     """
 
     def __init__(
-        self, folder: RunFolder, page: SharedPage, inherits: Sequence[int], loop: int | None
+        self,
+        folder: RunFolder,
+        page: SharedPage,
+        inherits: Sequence[int],
+        loop: int | Literal["act", "wait"],
     ) -> None:
         self._page = page
         page.put(PageField.GUARDIAN_PHASE, GuardianPhase.STARTING)
@@ -119,13 +132,14 @@ class GuardianProcess(ChildProcess):
         self._log = folder.guardian_log
         with ExitStack() as stack:
             watched = []
-            if loop is not None:
+            if isinstance(loop, int):
                 watched.append(os.pidfd_open(loop))
                 stack.callback(os.close, watched[0])
             process = start_process(
-                "hilctl.run.safety.guardian",
+                GUARDIAN,
                 str(folder.job),
-                *(["act"] if loop is None else [str(watched[0]), str(loop)]),
+                *map(str, watched),
+                str(loop),
                 inherits=(*inherits, *watched),
                 stderr=stack.enter_context(self._log.open("wb")),
             )
@@ -171,39 +185,60 @@ class GuardianProcess(ChildProcess):
 
 
 class GuardianRelief:
-    """Stop guardians of earlier runs that still drive a device."""
+    """Take a device over from guardians of earlier runs, which keep it until they are relieved.
+
+    If this process and those that inherit its locks end before, the guardians act again.
+    """
 
     def __init__(self, holds: Sequence[str]) -> None:
-        self.runs = [
-            run
-            for run in (runs() if holds else [])
-            if set(holds) & set(run.card.holds) and safe_result_of(run)
-        ]
-        for run in self.runs:
-            signal_guardian(run, signal.SIGKILL, _END_S)
+        self._pages: list[tuple[RunFolder, SharedPage]] = []
+        for run in runs() if holds else []:
+            if set(holds) & set(run.card.holds) and not run.supervised:
+                with suppress(OSError, ValueError):  # it has just ended
+                    self._pages.append((run, SampleRing(run.ring).page))
 
-    def resume(self, inherits: Sequence[int]) -> None:
-        """Start them again, and wait until they act: their outputs are not safe yet.
+    @property
+    def found(self) -> bool:
+        """Whether there are earlier runs whose output is not safe."""
+        return bool(self._pages)
 
-        Commands that follow can then find, stop or relieve them.
-        """
-        for run in self.runs:
-            try:
-                with locked_run(run) as lock:
-                    page = SampleRing(run.ring).page
-                    guardian = GuardianProcess(run, page, [*inherits, lock], None)
-                error = "" if guardian.await_acting() else guardian.error
-            except (OSError, ValueError) as failure:
-                error = str(failure)
-            if error:
-                _log.error("the guardian of %s cannot be started again: %s", run.card.name, error)
+    @property
+    def runs(self) -> list[RunFolder]:
+        """The runs whose guardian is active."""
+        return [run for run, _ in self._pages if run.alive]
 
-    def discard(self) -> None:
-        """Remove their folders: another process drives the device."""
-        for run in self.runs:
-            with suppress(OSError, ValueError):
-                if SampleRing(run.ring, look_only=True).page.get(PageField.RECORDED):
-                    run.remove()
+    def acquire(self, locks: DeviceLocks, stopped: Callable[[], bool] = lambda: False) -> None:
+        """Acquire the locks of a device; raise InputError if its guardian does not release them."""
+        deadline_s = time.monotonic() + _CLOSE_S
+        while self.runs and locks.holder() and not stopped():
+            for _, page in self._pages:
+                page.put(PageField.CLAIM, 1)
+            if time.monotonic() > deadline_s:
+                break
+            time.sleep(_POLL_S)
+        locks.acquire()
+
+    def note_write(self, value: float) -> None:
+        """Let the guardians continue a ramp from here if they act again."""
+        for _, page in self._pages:
+            page.note_safe_write(value)
+
+    def relieve(self) -> None:
+        """Let the guardians end and remove their folders: another process protects the device."""
+        for run, page in self._pages:
+            page.put(PageField.RELIEVED, 1)
+            if page.get(PageField.RECORDED):
+                run.remove()
+
+    def restart(self) -> None:
+        """Start the guardians again that have died; they act when the device is free."""
+        for run, page in self._pages:
+            if not run.alive and run.kept:
+                try:
+                    GuardianProcess(run, page, (), "wait")
+                except OSError as error:
+                    text = "the guardian of %s cannot be started again: %s"
+                    _log.error(text, run.card.name, error.strerror)
 
 
 def signal_guardian(run: RunFolder, number: int, wait_s: float = 0.0) -> bool:

@@ -15,8 +15,8 @@ from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.run.metadata import end_facts
 from hilctl.run.run_folder import RunFolder, runs, taken_over
-from hilctl.run.shared.ring import SampleRing
-from hilctl.run.shared.shared_page import PageField, PageSlot, Phase
+from hilctl.run.shared.ring import SampleRing, safe_result_of
+from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase
 
 
 @dataclass(frozen=True, slots=True)
@@ -32,17 +32,45 @@ class RecoveredRun:
 
 
 def recover_dead_runs() -> list[RecoveredRun]:
-    """Finish the recordings of all dead runs of this user, and remove their folders."""
+    """Finish the recordings of all runs of this user whose supervisor and loop are dead.
+
+    A guardian may still be active. The folder of a run stays for it, or until another command has
+    made an unsafe output safe.
+    """
     found = []
     for run in runs():
-        if run.alive:
+        if run.recorded and not run.alive and _is_settled(run):
+            run.remove()
+        if run.recorded or run.supervised or (run.alive and safe_result_of(run) is None):
             continue
         with taken_over(run) as ours, _undisturbed():
             if ours:
                 found.append(recovered := _recover(run))
                 if recovered.kept is None:
-                    run.remove()
+                    _finish(run, recovered)
     return found
+
+
+def _finish(run: RunFolder, recovered: RecoveredRun) -> None:
+    """Remove the folder of a recorded run, or keep it as long as its output is not safe."""
+    if recovered.safe or not (run.card.holds and recovered.started):
+        run.remove()
+        return
+    with suppress(OSError, ValueError):
+        SampleRing(run.ring).page.put(PageField.RECORDED, 1)  # its guardian removes the folder
+    run.keep(recorded=True)
+    if not run.alive and _is_settled(run):
+        run.remove()
+
+
+def _is_settled(run: RunFolder) -> bool:
+    """Return whether the output of a dead run needs no more attention."""
+    try:
+        page = SampleRing(run.ring, look_only=True).page
+    except (OSError, ValueError):
+        return True
+    over = page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.DONE
+    return over or bool(page.get(PageField.RELIEVED)) or page.ended_safely()
 
 
 def _recover(run: RunFolder) -> RecoveredRun:

@@ -7,11 +7,12 @@ both are held until the output is safe, even if the supervisor dies.
 systemd-logind removes the folder of an active run when its user logs out (RemoveIPC). The files
 stay open in the processes of the run, and are found through ``/proc``.
 
-The lock of a device is a file that only this user can lock. A bound name of an abstract Unix socket
-warns other users. Any user can bind it, so it excludes a run only if this user or root has bound
-it.
+A device has two locks. A file excludes other runs of this user. A bound name of an abstract Unix
+socket excludes other users and other folders for runs; any user can bind it, so a run can be told
+to ignore a name that another user has bound. The process that holds the locks owns the device.
 """
 
+import errno
 import hashlib
 import json
 import logging
@@ -28,7 +29,13 @@ from pathlib import Path
 from typing import Any, Self
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.base.private_dirs import is_locked, private_folder, take_lock, user_folders
+from hilctl.base.private_dirs import (
+    is_locked,
+    private_folder,
+    release_lock,
+    take_lock,
+    user_folders,
+)
 
 _log = logging.getLogger(__name__)
 
@@ -36,10 +43,15 @@ WORKS_ANYWHERE = "report, replay, export, identify, compare, check and learn --f
 
 _CARD = "run.json"
 _KEPT = "kept"
+_RECORDED = "recorded"
 _SUPERVISOR = "supervisor.lock"
 _DEVICES = "devices"
 _REMOVED = " (deleted)"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
+GUARDIAN = "hilctl.run.safety.guardian"
+"""Module of the guardian's process."""
+_IF_OWN = "wait for its end, or stop it first"
+_IF_STRANGER = "ask its user to stop it; hilctl run --take-over runs nevertheless"
 _BACKLOG = 1000  # connections that query the holder of a device; never accepted
 
 
@@ -103,14 +115,21 @@ class RunFolder:
         """Whether a process of the run is alive."""
         return _is_locked(self._file(_CARD))
 
-    def keep(self) -> None:
-        """Keep the folder after the supervisor, for a guardian or for samples in the ring."""
+    def keep(self, *, recorded: bool) -> None:
+        """Keep the folder after the supervisor, for an output or samples that are not safe yet."""
+        if recorded:
+            (self.path / _RECORDED).touch()
         (self.path / _KEPT).touch()
 
     @property
     def kept(self) -> bool:
         """Whether the folder stays after the supervisor."""
         return (self.path / _KEPT).exists()
+
+    @property
+    def recorded(self) -> bool:
+        """Whether the recording is complete, and the folder was kept for the output alone."""
+        return (self.path / _RECORDED).exists()
 
     def remove(self) -> None:
         """Remove the folder."""
@@ -270,51 +289,123 @@ def _new_folder(path: Path) -> Path:
             made = path.with_name(f"{path.name}-{number}")
 
 
-@contextmanager
-def held_devices(holds: Sequence[str]) -> Iterator[list[int]]:
-    """Lock a device's resources against other runs of this user and of root; yield the locks.
+class DeviceLocks:
+    """Locks of a device's resources, opened before they are acquired.
 
-    A run of another user causes only a warning, because its lock could be forged.
+    Processes that inherit the descriptors hold the locks that are acquired later, until they end.
+
+    Args:
+        holds: Resources, see :attr:`hilctl.base.device.DeviceInfo.holds`.
+        take_over: Whether to ignore other users.
+        inherited: The :attr:`descriptors` of the process that acquired the locks.
 
     Raises:
-        InputError: Another run holds one of them.
         RunError: The file of a lock cannot be created.
     """
-    with ExitStack() as stack:
-        # In the same order for all runs, so that one of two runs gets all of them.
+
+    def __init__(
+        self, holds: Sequence[str], *, take_over: bool = False, inherited: Sequence[int] = ()
+    ) -> None:
+        self._take_over = take_over
         names = sorted(set(holds))
-        yield [lock for name in names for lock in stack.enter_context(_held(name))]
+        self._files = dict(zip(names, inherited, strict=False))
+        self._names = {
+            name: socket.socket(fileno=descriptor)
+            for name, descriptor in zip(names, inherited[len(names) :], strict=False)
+        }
+        if inherited:
+            return
+        folder = base_folder() / _DEVICES if holds else Path()
+        try:
+            # In the same order for all runs, so that one of two runs gets all of them.
+            for name in names:
+                path = private_folder(folder) / f"{_digest(name)}.lock"
+                self._files[name] = os.open(path, os.O_RDWR | os.O_CREAT, 0o600)
+                self._names[name] = socket.socket(socket.AF_UNIX)
+        except OSError as error:
+            self.close()
+            raise RunError(f"{folder}: {name} cannot be locked: {error.strerror}") from None
+
+    @property
+    def descriptors(self) -> list[int]:
+        """The descriptors to inherit."""
+        return [*self._files.values(), *(each.fileno() for each in self._names.values())]
+
+    def holder(self) -> str:
+        """Acquire all locks, or none if another run of this user has one: return its resource.
+
+        Raises:
+            InputError: Another user or another folder for runs has a resource.
+        """
+        for name, file in self._files.items():
+            try:
+                take_lock(file)
+            except BlockingIOError:
+                for each in self._files.values():
+                    release_lock(each)
+                return name
+        for name, told in self._names.items():
+            try:
+                told.bind(_address(name))
+                told.listen(_BACKLOG)
+            except OSError as error:
+                if error.errno == errno.EINVAL:  # bound before
+                    continue
+                self._refuse(name)
+        return ""
+
+    def acquire(self) -> None:
+        """Acquire all locks; raise InputError if another run has one."""
+        if name := self.holder():
+            holder = _holder(_address(name))
+            raise _in_use(name, holder if _is_trusted(holder) else None)
+
+    def release(self) -> None:
+        """Release the locks for all processes that share them; they can be acquired again."""
+        for file in self._files.values():
+            release_lock(file)
+        for name, told in self._names.items():
+            told.close()
+            self._names[name] = socket.socket(socket.AF_UNIX)
+
+    def _refuse(self, name: str) -> None:
+        holder = _holder(_address(name))
+        if _is_trusted(holder):
+            raise _in_use(name, holder)
+        if not self._take_over:
+            raise _in_use(name, holder, _IF_STRANGER)
+        text = "%s may be in use by %s as well: only one program must drive a device"
+        _log.warning(text, name, _text_of(holder))
+
+    def close(self) -> None:
+        """Release the locks, unless processes that inherited them hold them."""
+        for file in self._files.values():
+            os.close(file)
+        for told in self._names.values():
+            told.close()
+        self._files, self._names = {}, {}
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        self.close()
 
 
 @contextmanager
-def _held(name: str) -> Iterator[list[int]]:
-    digest = hashlib.sha256(os.fsencode(name)).hexdigest()
-    address = b"\0hilctl/device/" + digest.encode()
-    with ExitStack() as stack:
-        folder = base_folder() / _DEVICES
-        try:
-            private_folder(folder)
-            locks = [stack.enter_context(_locked(folder / f"{digest}.lock"))]
-        except BlockingIOError:
-            holder = _holder(address)
-            raise _in_use(name, holder if _is_trusted(holder) else None) from None
-        except OSError as error:
-            raise RunError(f"{folder}: {name} can't be locked: {error.strerror}") from None
-        told = stack.enter_context(socket.socket(socket.AF_UNIX))
-        try:
-            told.bind(address)
-            told.listen(_BACKLOG)
-            locks.append(told.fileno())
-        except OSError:
-            holder = _holder(address)
-            if _is_trusted(holder):
-                raise _in_use(name, holder) from None
-            _log.warning(
-                "%s may be in use by %s as well: only one program must drive a device",
-                name,
-                _text_of(holder),
-            )
-        yield locks
+def held_devices(holds: Sequence[str], *, take_over: bool = False) -> Iterator[None]:
+    """Lock a device's resources, see :meth:`DeviceLocks.acquire`."""
+    with DeviceLocks(holds, take_over=take_over) as locks:
+        locks.acquire()
+        yield
+
+
+def _digest(name: str) -> str:
+    return hashlib.sha256(os.fsencode(name)).hexdigest()
+
+
+def _address(name: str) -> bytes:
+    return b"\0hilctl/device/" + _digest(name).encode()
 
 
 def _holder(address: bytes) -> tuple[int, int] | None:
@@ -334,20 +425,32 @@ def _is_trusted(holder: tuple[int, int] | None) -> bool:
     return holder is not None and holder[1] in {0, os.geteuid()}
 
 
-def _in_use(name: str, holder: tuple[int, int] | None) -> InputError:
-    hint = "wait for its end, or stop it first"
-    if holder and holder[0] and not Path(f"/proc/{holder[0]}").exists():
+def _in_use(name: str, holder: tuple[int, int] | None, hint: str = _IF_OWN) -> InputError:
+    if guardian := _guardian_of(name):
+        run, folder = guardian.card.name, guardian.path.parent
         hint = (
-            "its supervisor has ended, and its loop or guardian still sets the safe value. hilctl "
-            "status (with its HILCTL_RUNS) lists it; hilctl stop --run NAME ends the guardian, and "
-            "leaves the output as it is"
+            f"the guardian of {run} sets its safe value. HILCTL_RUNS={folder} hilctl stop --run "
+            f"{run} ends it, and leaves the output as it is"
         )
     return InputError(f"{name} is in use by {_text_of(holder)}: {hint}")
 
 
+def _guardian_of(name: str) -> RunFolder | None:
+    """Return the run whose guardian holds a resource after its supervisor, in any folder."""
+    for command in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError, ValueError, TypeError):  # ended, or no run
+            words = command.read_bytes().split(b"\0")
+            if GUARDIAN.encode() in words:
+                folder = Path(os.fsdecode(words[words.index(GUARDIAN.encode()) + 1])).parent
+                card = RunCard.from_json((folder / _CARD).read_text(encoding="utf-8"))
+                if name in card.holds and not (run := RunFolder(folder, card)).supervised:
+                    return run
+    return None
+
+
 def _text_of(holder: tuple[int, int] | None) -> str:
     if holder is None:
-        return "another run"
+        return "another program"
     process, user = holder
     for run in runs():
         if run.card.supervisor == process:
@@ -371,24 +474,17 @@ def _locked(path: Path) -> Iterator[int]:
 
 
 @contextmanager
-def locked_run(run: RunFolder) -> Iterator[int]:
-    """Lock a dead run and yield the descriptor; raise BlockingIOError if it is alive."""
-    with _locked(run.path / _CARD) as descriptor:
-        yield descriptor
-
-
-@contextmanager
 def taken_over(run: RunFolder) -> Iterator[bool]:
-    """Try to lock a dead run; yield whether it is locked, and not alive or recovered by another."""
+    """Act for the dead supervisor of a run; yield whether no other command does, or did."""
     try:
-        descriptor = os.open(run.path / _CARD, os.O_RDWR)
+        descriptor = os.open(run.path / _SUPERVISOR, os.O_RDWR | os.O_CREAT, 0o600)
     except FileNotFoundError:
         yield False
         return
     try:
         take_lock(descriptor)
-        # Under the lock: another command may have removed the folder before.
-        held = (run.path / _CARD).exists()
+        # Under the lock: another command may have finished the run before.
+        held = (run.path / _CARD).exists() and not run.recorded
     except BlockingIOError:
         held = False
     try:

@@ -72,14 +72,18 @@ def start_run(
     overwrite: bool,
     on_progress: Callable[[Progress], None],
     heat_a2: float = 0.0,
+    take_over: bool = False,
 ) -> RunResult:
     """Run an experiment file to its end; in a separate process if this program has threads.
 
+    With ``take_over`` a device is used although another user's process has it.
     Raise InputError or RunError if the run cannot start: nothing has moved, and no file is left.
     """
     require_linux()
     if has_threads():
-        return run_in_own_process((path, settings, output, overwrite, heat_a2), on_progress)
+        return run_in_own_process(
+            (path, settings, output, overwrite, heat_a2, take_over), on_progress
+        )
     from hilctl.run.supervisor import Supervisor  # Linux only
 
     checked = checked_experiment(path, settings, heat_a2)
@@ -87,7 +91,9 @@ def start_run(
     if checked.begun.begins and checked.loaded.device.info.holds:
         _log.warning("the compensator begins %s", checked.begun.begins)
     output = output_of(checked, output)
-    return Supervisor(checked, output, overwrite=overwrite, on_progress=on_progress).run()
+    return Supervisor(
+        checked, output, overwrite=overwrite, take_over=take_over, on_progress=on_progress
+    ).run()
 
 
 def default_output(name: str, folder: Path, now: time.struct_time) -> Path:
@@ -174,8 +180,9 @@ def completed_key(path: Path) -> RunKey | None:
     return RunKey.of_facts(ends.run) if ends.end.get("code") == "completed" else None
 
 
-Given = tuple[Path, Sequence[str], Path | None, bool, float]
-"""Experiment file, settings, recording, whether it may be replaced, and heat of the coil."""
+Given = tuple[Path, Sequence[str], Path | None, bool, float, bool]
+"""Experiment file, settings, recording, whether it may be replaced, heat of the coil, whether
+other users' processes are ignored."""
 
 _START = (
     # Until the supervisor handles signals: nothing has moved.
@@ -280,9 +287,9 @@ def main(descriptor: int) -> None:
             except OSError:  # the parent process has ended
                 os.kill(os.getpid(), signal.SIGTERM)
 
-        file, settings, output, overwrite, heat_a2 = given
+        file, settings, output, overwrite, heat_a2, take_over = given
         try:
-            send(start_run(file, settings, output, overwrite, show, heat_a2))
+            send(start_run(file, settings, output, overwrite, show, heat_a2, take_over))
         except HilctlError as error:
             send(error)
 

@@ -31,7 +31,7 @@ from hilctl.run.metadata import RunDescription
 from hilctl.run.processes import GuardianProcess, GuardianRelief, LoopProcess
 from hilctl.run.recorder import Recorder, RingRecorder
 from hilctl.run.result import Progress, RunResult
-from hilctl.run.run_folder import RunFolder, held_devices, run_folder
+from hilctl.run.run_folder import DeviceLocks, RunFolder, run_folder
 from hilctl.run.safety.safety_monitor import SafetyMonitor
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot, SharedPage, Stop
@@ -155,6 +155,11 @@ class RunMonitor:
             self._conclude(ended=ended)
         return not self._recording.finished
 
+    @property
+    def unsafe(self) -> bool:
+        """Whether the output is not known to be safe, although the device could confirm it."""
+        return self.outcome is None or self.outcome.output in {"set", "unknown"}
+
     def break_off(self, error: Exception) -> None:
         """Stop the loop by its safe ramp because the supervisor failed."""
         self.broke = self.broke or f"{type(error).__name__}: {error}"
@@ -231,9 +236,11 @@ class Supervisor:
         output: Path,
         *,
         overwrite: bool,
+        take_over: bool = False,
         on_progress: Callable[[Progress], None],
     ) -> None:
         self._checked = checked
+        self._take_over = take_over
         self._config = checked.loaded.config
         self._output = output
         self._overwrite = overwrite
@@ -255,12 +262,12 @@ class Supervisor:
             stack.enter_context(self._signals())
             holds = self._checked.loaded.device.info.holds
             relief = GuardianRelief(holds)
-            locks: list[int] = []
-            recorder = None
-            try:
+            locks = stack.enter_context(DeviceLocks(holds, take_over=self._take_over))
+            if not relief.runs:
                 # The device before the recording: a refused run must not touch a file.
-                locks = stack.enter_context(held_devices(holds))
-                recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
+                locks.acquire()
+            recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
+            try:
                 folder, own = stack.enter_context(
                     run_folder(config.name, self._output, time.time(), holds)
                 )
@@ -268,20 +275,21 @@ class Supervisor:
                 recording = RingRecorder(ring, recorder, config.recording.flush_s)
                 requests = Requests(self._checked, folder, ring.page, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
-                self._write_job(folder)
+                self._write_job(folder, locks.descriptors)
                 # Kept open: watchers find it even if the folder is removed.
                 stack.enter_context(folder.description.open("rb"))
-                child = LoopProcess(folder, ring.page, locks + own)
+                inherits = locks.descriptors + own
+                child = LoopProcess(folder, ring.page, inherits)
                 run = folder, ring, child, recording
-                safety, start_ns = self._start(stack, *run, locks + own)
+                acquire = partial(relief.acquire, locks, lambda: self._stop_signal != 0)
+                safety, start_ns = self._start(stack, *run, inherits, acquire)
                 started = RunMonitor(self._checked, ring, child, safety, recording)
             except BaseException:
-                if recorder is not None:
-                    recorder.discard()
-                relief.resume(locks)
+                recorder.discard()
                 raise
-            relief.discard()
             _go(ring.page, start_ns)
+            # From here on the processes of this run keep the output safe.
+            relief.relieve()
             if (trigger := config.trigger) is not None and trigger.start is not None:
                 name = self._checked.loaded.device.info.digital_input
                 awaited = name, trigger.start, trigger.timeout_s
@@ -290,8 +298,10 @@ class Supervisor:
             ring.page.put(PageField.RECORDED, int(not recorder.error))
             stops = self._stops
             guarded = safety.close(lambda: self._stops > stops)
-            if guarded or recorder.error:
-                folder.keep()  # for its guardian, or for samples that are only in the ring
+            unsafe = bool(holds) and started.unsafe
+            if guarded or unsafe or recorder.error:
+                # For its guardian, the next command, or samples that are only in the ring.
+                folder.keep(recorded=not recorder.error)
             return self._result(started, recorder, ring, folder, guarded=guarded)
 
     def _start(
@@ -301,16 +311,17 @@ class Supervisor:
         ring: SampleRing,
         child: LoopProcess,
         recording: RingRecorder,
-        locks: list[int],
+        inherits: list[int],
+        acquire: Callable[[], None],
     ) -> tuple[SafetyMonitor, int]:
         """Wait until loop and guardian are ready, and begin the recording."""
         page, checked = ring.page, self._checked
         safety = None
         try:
             simulated = checked.loaded.device.info.simulated  # needs no guardian
-            guardian = None if simulated else partial(GuardianProcess, folder, page, locks)
+            guardian = None if simulated else partial(GuardianProcess, folder, page, inherits)
             safety = SafetyMonitor(checked, ring, child, guardian, recording.record_event)
-            child.await_ready(lambda: self._stop_signal != 0)
+            child.await_ready(lambda: self._stop_signal != 0, acquire)
             # Started after the loop, because it watches the loop's process.
             self._await_guardian(safety)
             start_ns = self._begin(recording.recorder, page)
@@ -412,12 +423,14 @@ class Supervisor:
                 if handler is not None:  # None: not set by Python
                     signal.signal(number, handler)
 
-    def _write_job(self, folder: RunFolder) -> None:
+    def _write_job(self, folder: RunFolder, locks: list[int]) -> None:
         """Write the job for loop and guardian, and the description for watchers."""
         recording = self._config.recording
         # The supervisor may be silent until half of the ring is full.
         silence_s = recording.ring_s / 2.0 if recording.on_failure == "stop" else float("inf")
-        job = Job.of(self._checked, folder, supervisor=os.getpid(), silence_s=silence_s)
+        job = Job.of(
+            self._checked, folder, locks=locks, supervisor=os.getpid(), silence_s=silence_s
+        )
         job.write(folder.job)
         RunDescription.of(self._checked).write(folder.description)
 

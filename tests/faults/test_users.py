@@ -2,7 +2,6 @@
 
 import json
 import os
-import signal
 import subprocess
 import sys
 import tempfile
@@ -73,24 +72,21 @@ def test_the_second_user_of_a_device_is_refused(neighbour, device, run):
 
 
 @pytest.mark.long  # the other user compiles the kernels
-def test_root_is_warned_of_a_device_that_a_user_has(neighbour, device, run):
-    """Root gets a warning only, because a user's claim is not trusted."""
+def test_a_device_that_another_user_has_is_refused_unless_taken_over(neighbour, device, run):
     theirs = neighbour.start()
     device.log.await_events("DAC0", 40, theirs)
     mine = run(device.section, **PATIENT)
-    deadline = time.monotonic() + 240.0
-    while not mine.output.exists():  # claimed after the device is locked
-        assert time.monotonic() < deadline
-        time.sleep(0.02)
+    assert f"process {theirs.pid} of nobody" in mine.refused()
+    path = mine.output.with_suffix(".yaml")
+    written = len(device.log.events("DAC0"))
+    short = ("--set", "waveform.duration_s=0.5", "--output", path.with_name("short.mcap"))
+    hilctl("run", path, "--take-over", *short)
+    assert len(device.log.events("DAC0")) > written + 20
     theirs.terminate()
     out, err = theirs.communicate(timeout=240)
     assert "Traceback" not in err
     assert json.loads(out)["output_safe"]
     assert (neighbour.folder / "theirs.mcap").stat().st_uid != os.geteuid()
-    device.log.await_events("DAC0", len(device.log.events("DAC0")) + 20, mine.process)
-    mine.process.send_signal(signal.SIGINT)
-    _, err = mine.process.communicate(timeout=240)
-    assert f"process {theirs.pid} of nobody" in err
 
 
 SQUATTER = """
@@ -103,8 +99,10 @@ input()
 """
 
 
-def test_a_user_who_only_takes_the_name_keeps_nobody_out(nobody, device, run, tmp_path):
-    """A claim without a lock rejects neither a run nor ``hilctl safe``."""
+def test_a_user_who_only_takes_the_name_keeps_nobody_from_the_safe_value(
+    nobody, device, run, tmp_path
+):
+    """A run can ignore the name, and ``hilctl safe`` does."""
     section = device.section
     name = f"tcp:{section['host']}:{section['tcp_port']}"
     squatter = subprocess.Popen(
@@ -114,12 +112,10 @@ def test_a_user_who_only_takes_the_name_keeps_nobody_out(nobody, device, run, tm
     try:
         assert squatter.stdout.readline() == "taken\n"
         mine = run(section, **PATIENT)
-        device.log.await_events("DAC0", 40, mine.process)
-        words = ("safe", tmp_path / "run.yaml")
-        hilctl(*words, code=2)  # refused by the run, which has the lock
-        mine.process.send_signal(signal.SIGINT)
-        _, err = mine.process.communicate(timeout=240)
-        assert f"process {squatter.pid} of nobody" in err
-        assert "confirmed" in hilctl(*words).stdout
+        assert f"process {squatter.pid} of nobody" in mine.refused()
+        path = tmp_path / "run.yaml"
+        assert "confirmed" in hilctl("safe", path).stdout
+        short = ("--set", "waveform.duration_s=0.5", "--output", path.with_name("short.mcap"))
+        hilctl("run", path, "--take-over", *short)
     finally:
         squatter.communicate("\n", timeout=60)

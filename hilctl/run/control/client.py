@@ -153,8 +153,17 @@ def status_of(run: RunFolder) -> dict[str, Any]:
             return ask(run.socket, request("status"))
         except (RunError, InputError) as error:
             return {**facts_of(run), "state": "not answering", "error": str(error)}
-    state = "ramping down without its supervisor" if run.alive else "dead"
-    return {**facts_of(run), "state": state, **_guardian_status(run)}
+    if run.alive:
+        state = {"state": "ramping down without its supervisor"}
+    elif run.recorded:
+        why = (
+            "all its processes ended before the output was safe. hilctl safe EXPERIMENT sets the "
+            f"safe value; hilctl recover --dismiss {run.card.name} forgets the run"
+        )
+        state = {"state": "dead", "output_state": "unknown", "error": why}
+    else:
+        state = {"state": "dead"}
+    return {**facts_of(run), **state, **_guardian_status(run)}
 
 
 def _guardian_status(run: RunFolder) -> dict[str, Any]:
@@ -270,7 +279,7 @@ def assigned(assignments: Sequence[str]) -> dict[str, Any]:
 
 def finish_dead_runs() -> None:
     """Recover the samples of dead runs, and log the result of each."""
-    if all(run.alive for run in runs()):
+    if all(run.supervised or (run.recorded and run.alive) for run in runs()):
         return
     from hilctl.run.recovery import recover_dead_runs  # its imports take a second
 

@@ -8,7 +8,11 @@ It acts if the loop hangs or dies without a confirmed safe output. It retries un
 confirms the safe value, even after the supervisor has ended; then SIGTERM ends it. The supervisor
 drives the device only after the guardian has ended, so two processes never hold it.
 
-As ``python -m hilctl.run.safety.guardian JOB act`` it acts immediately, without a loop to watch.
+Another command can claim the device. The guardian then closes it, releases its locks and waits for
+them: it acts again when they are free, unless that command has relieved it.
+
+As ``python -m hilctl.run.safety.guardian JOB act`` it acts without a loop to watch, as soon as the
+supervisor does not; as ``JOB wait`` it first waits for the locks of the device.
 """
 
 import os
@@ -25,12 +29,12 @@ from pathlib import Path
 from types import FrameType
 
 from hilctl.base.device import Device
-from hilctl.base.errors import HilctlError
-from hilctl.loop.safe_output import LocalError, SafeGoal, SafeOutput
-from hilctl.machine.rt_setup import be_quick
+from hilctl.base.errors import HilctlError, InputError
+from hilctl.loop.safe_output import PATIENT_AFTER_S, LocalError, SafeGoal, SafeOutput
+from hilctl.machine.rt_setup import be_ordinary, be_quick
 from hilctl.machine.syscalls import LinuxProcess
 from hilctl.run.job import Job, SilenceLimits
-from hilctl.run.run_folder import keep_removed
+from hilctl.run.run_folder import DeviceLocks, keep_removed
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import (
     GuardianPhase,
@@ -44,6 +48,9 @@ from hilctl.run.shared.shared_page import (
 _LONGEST_POLL_NS = 10_000_000
 _CLOSING_S = 30.0
 _POLL_MS = 5
+_AGAIN_S = 1.0
+_WAIT_S = 0.05
+_CLAIM_S = 0.2  # in which a command that claims the device must acquire the locks
 LAST_CALL_MS = 5
 """Longest wait for a killed process to leave a system call.
 
@@ -155,6 +162,11 @@ class SafeAction:
         self._thread.join(wait_s)
         return self._result
 
+    @property
+    def is_over(self) -> bool:
+        """Whether nothing more is written: the result is final, it failed or was ended."""
+        return not self._thread.is_alive()
+
     def end(self, wait_s: float) -> bool:
         """Stop writing; return whether the last write ends within ``wait_s``."""
         self._ending.set()
@@ -163,52 +175,120 @@ class SafeAction:
 
 
 class Guardian:
-    """Watch the loop, and set the output to its safe value if the loop died or hangs."""
+    """Watch the loop, and set the output to its safe value if the loop died or hangs.
+
+    Args:
+        has_locks: Whether this process inherited the locks of the device.
+    """
 
     def __init__(
         self,
         ring: SampleRing,
         device: Device,
         job: Job,
-        pidfd: int,
-        loop: int,
         prepare: Callable[[], object] = lambda: None,
+        *,
+        has_locks: bool = True,
     ) -> None:
         self._ring, self._page = ring, ring.page
-        self._device, self._job, self._pidfd = device, job, pidfd
+        self._device, self._job = device, job
         self._prepare = prepare
-        self._watch = HangWatch(ring.page, job.limits, lambda: is_stopped(loop))
-        self._death = select.poll()
-        self._death.register(pidfd, select.POLLIN)
+        self._locks = DeviceLocks(job.holds, inherited=job.locks if has_locks else ())
+        self._has_locks = has_locks
+        self._ended = threading.Event()  # by the user
 
-    def watch(self) -> bool:
-        """Watch until the output is safe; return False if another process must drive the device."""
+    def watch(self, pidfd: int, loop: int) -> None:
+        """Watch the loop, by its pidfd and number, until the output is safe; act if necessary."""
         page = self._page
+        watch = HangWatch(page, self._job.limits, lambda: is_stopped(loop))
+        death = select.poll()
+        death.register(pidfd, select.POLLIN)
         page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
         # After the heartbeat: an old one would count as silence.
         page.put(PageField.GUARDIAN_PHASE, GuardianPhase.WATCHING)
-        while True:
+        hung = False
+        while not death.poll(_POLL_MS):
             now_ns = time.monotonic_ns()
             page.put(PageField.GUARDIAN_HEARTBEAT_NS, now_ns)
-            if self._death.poll(_POLL_MS):
-                # Without the start signal nothing was sent.
-                if not page.get(PageField.GO) or page.ended_safely():
-                    return True
-                return act(page, self._device, self._goal(), hung=False, prepare=self._prepare)
-            if self._watch.hangs(now_ns):
-                self._kill_loop()
-                if page.ended_safely():
-                    return True
-                return act(page, self._device, self._goal(), hung=True, prepare=self._prepare)
+            if hung := watch.hangs(now_ns):
+                # If it continued, it would send old commands.
+                with suppress(ProcessLookupError):
+                    signal.pidfd_send_signal(pidfd, signal.SIGKILL)
+                death.poll(LAST_CALL_MS)
+                break
+        # Without the start signal nothing was sent.
+        if page.get(PageField.GO) and not page.ended_safely():
+            self.act(hung=hung)
 
-    def _goal(self) -> SafeGoal:
-        return safe_goal(self._ring, self._device, self._job.safe_value, self._job.ramp_per_s)
+    def act(self, *, hung: bool) -> None:
+        """Drive the device until the result is final, SIGTERM, or another process relieves it."""
+        page = self._page
+        page.leave_safe_result(SafeActionResult(hung, "unknown", "", final=False))
+        signal.signal(signal.SIGTERM, self._end)
+        while self._awaits_device():
+            page.put(PageField.GUARDIAN_PHASE, GuardianPhase.ACTING)
+            goal = safe_goal(self._ring, self._device, self._job.safe_value, self._job.ramp_per_s)
+            action = SafeAction(page, self._device, goal, hung=hung, prepare=self._prepare)
+            if self._is_final(action):
+                action.end(0.0)
+                break
+            while not action.end(_WAIT_S):
+                self._beat()
+            if page.get(PageField.CLAIM):
+                self._release_device()
+        page.put(PageField.GUARDIAN_PHASE, GuardianPhase.DONE)
 
-    def _kill_loop(self) -> None:
-        """Kill the loop: if it continued, it would send old commands."""
-        with suppress(ProcessLookupError):
-            signal.pidfd_send_signal(self._pidfd, signal.SIGKILL)
-        self._death.poll(LAST_CALL_MS)
+    def _end(self, number: int, frame: FrameType | None) -> None:
+        self._ended.set()
+
+    def _beat(self) -> None:
+        self._page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
+
+    def _is_final(self, action: SafeAction) -> bool:
+        """Follow an action to its end; return False if it must be interrupted or repeated."""
+        page, poll_s, began_s = self._page, _POLL_MS * 1e-3, time.monotonic()
+        while not (result := action.result(poll_s)).final and not self._ended.is_set():
+            self._beat()
+            page.leave_safe_result(result)
+            if action.failed:
+                # The supervisor kills this process before it acts itself; without one, try again.
+                page.write_text(PageSlot.GUARDIAN, action.failed)
+                page.put(PageField.GUARDIAN_PHASE, GuardianPhase.FAILED)
+                self._ended.wait(_AGAIN_S)
+                return False
+            if page.get(PageField.CLAIM):
+                return False
+            if time.monotonic() - began_s > PATIENT_AFTER_S and not self._supervised():
+                be_ordinary()
+                poll_s = _AGAIN_S
+        page.leave_safe_result(result)
+        return True
+
+    def _supervised(self) -> bool:
+        return os.getppid() == self._job.supervisor
+
+    def _release_device(self) -> None:
+        """Close the device and release its locks, for the command that claims it."""
+        page = self._page
+        self._device.close()
+        page.put(PageField.GUARDIAN_PHASE, GuardianPhase.WAITING)
+        page.put(PageField.CLAIM, 0)
+        self._locks.release()
+        self._has_locks = False
+        self._ended.wait(_CLAIM_S)
+
+    def _awaits_device(self) -> bool:
+        """Wait until no other process has the device; return False if that is not necessary."""
+        while not (self._ended.is_set() or self._page.get(PageField.RELIEVED)):
+            self._beat()
+            if not (self._page.get(PageField.STANDS_IN) and self._supervised()):
+                with suppress(InputError):  # another user has the device
+                    self._has_locks = self._has_locks or not self._locks.holder()
+                if self._has_locks:
+                    return True
+            self._page.put(PageField.GUARDIAN_PHASE, GuardianPhase.WAITING)
+            self._ended.wait(_WAIT_S)
+        return False
 
 
 def safe_goal(ring: SampleRing, device: Device, value: float, ramp_per_s: float) -> SafeGoal:
@@ -225,43 +305,8 @@ def safe_goal(ring: SampleRing, device: Device, value: float, ramp_per_s: float)
     return SafeGoal(value, ramp_per_s, start, bool(unanswered))
 
 
-def act(
-    page: SharedPage,
-    device: Device,
-    goal: SafeGoal,
-    *,
-    hung: bool,
-    prepare: Callable[[], object] = lambda: None,
-) -> bool:
-    """Drive the device until the result is final or SIGTERM; return False if that is impossible."""
-    ended_by_user = False
-
-    def end(number: int, frame: FrameType | None) -> None:
-        nonlocal ended_by_user
-        ended_by_user = True
-
-    page.leave_safe_result(SafeActionResult(hung, "unknown", "", final=False))
-    page.put(PageField.GUARDIAN_PHASE, GuardianPhase.ACTING)
-    signal.signal(signal.SIGTERM, end)
-    action = SafeAction(page, device, goal, hung=hung, prepare=prepare)
-    while not (result := action.result(_POLL_MS * 1e-3)).final and not ended_by_user:
-        page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns())
-        page.leave_safe_result(result)
-        if action.failed:
-            _fail(page, action.failed)
-            return False
-    page.leave_safe_result(result)
-    return True
-
-
-def _fail(page: SharedPage, text: str) -> None:
-    page.write_text(PageSlot.GUARDIAN, text)
-    # After the text, which readers expect in this phase.
-    page.put(PageField.GUARDIAN_PHASE, GuardianPhase.FAILED)
-
-
 def main(words: list[str]) -> int:
-    """Guard one run; the exit code is 0 if the job could be read and the device driven."""
+    """Guard one run; the exit code is 0 if the job could be read."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends after the loop
     job = Job.read(Path(words[0]))
@@ -271,21 +316,23 @@ def main(words: list[str]) -> int:
     try:
         device = job.device()
     except (HilctlError, MemoryError) as error:
-        _fail(page, str(error) or "not enough memory")
+        page.write_text(PageSlot.GUARDIAN, str(error) or "not enough memory")
+        # After the text, which readers expect in this phase.
+        page.put(PageField.GUARDIAN_PHASE, GuardianPhase.FAILED)
         return 1
     "localhost".encode("idna")  # import the codec now, not at the first connection
     process = LinuxProcess()
     _stay_in_memory(process)
     be_quick(job.safe_priority, process)
     prepare = partial(be_quick, job.safe_priority, process)
-    if words[1] == "act":
-        goal = safe_goal(ring, device, job.safe_value, job.ramp_per_s)
-        done = act(page, device, goal, hung=False, prepare=prepare)
+    guardian = Guardian(ring, device, job, prepare, has_locks=words[1] != "wait")
+    if words[1] in {"act", "wait"}:
+        guardian.act(hung=False)
     else:
-        done = Guardian(ring, device, job, int(words[1]), int(words[2]), prepare).watch()
+        guardian.watch(int(words[1]), int(words[2]))
     if os.getppid() != job.supervisor:
         _leave_folder(Path(words[0]).parent, page)
-    return 0 if done else 1
+    return 0
 
 
 def _leave_folder(folder: Path, page: SharedPage) -> None:

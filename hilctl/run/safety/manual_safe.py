@@ -3,7 +3,7 @@
 import logging
 import time
 from collections.abc import Callable, Sequence
-from contextlib import ExitStack
+from contextlib import ExitStack, suppress
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -14,7 +14,6 @@ from hilctl.base.yaml import load_document
 from hilctl.experiment.devices import made_device
 from hilctl.experiment.file import Safe
 from hilctl.loop.safe_output import (
-    HOLD_S,
     PATIENCE_S,
     LocalError,
     OutputState,
@@ -22,7 +21,7 @@ from hilctl.loop.safe_output import (
     SafeOutput,
 )
 from hilctl.run.processes import GuardianRelief
-from hilctl.run.run_folder import held_devices, runs
+from hilctl.run.run_folder import DeviceLocks
 
 _log = logging.getLogger(__name__)
 
@@ -59,8 +58,8 @@ def put_safe(
 ) -> SafeResult:
     """Set the device of an experiment to the experiment's safe value, without a ramp.
 
-    Only these sections of the file are validated. A guardian of an earlier run that drives the
-    device is stopped, and started again if the device does not confirm.
+    Only these sections of the file are validated. A guardian of an earlier run leaves the device
+    to this command, and acts again if the device does not confirm.
 
     Raises:
         InputError: The file is not valid, or a run holds the device; nothing was sent.
@@ -74,68 +73,59 @@ def put_safe(
     if device is None:
         raise ConfigError([ConfigProblem(str(path), "device", "is required, with a key kind")])
     info = device.info
-    died, relief = _earlier_run(info.holds)
+    died, relief = _earlier_runs(info.holds)
     goal = SafeGoal(safe.value, 1.0, None, pending=died)
-    output = SafeOutput(device, goal, clock)
+    output = SafeOutput(device, goal, clock, relief.note_write)
     with ExitStack() as stack:
-        locks: list[int] = []
-        try:
-            # Refused while a run holds the device: its loop would overwrite the safe value.
-            locks = _locks(stack, info.holds)
-            _drive(output, clock, sleep, watches=not relief.runs)
-        finally:
-            if output.final:
-                relief.discard()
-            else:
-                relief.resume(locks)
+        # Refused while a run holds the device: its loop would overwrite the safe value.
+        _acquire(stack, info.holds, relief)
+        stack.callback(device.close)
+        _drive(output, clock, sleep)
+        if output.final:
+            relief.relieve()
+        else:
+            relief.restart()
     return SafeResult(
         device=info.description,
         value=safe.value,
         unit=info.command_unit,
         output=output.state,
         error=output.error,
-        guardian_active=bool(relief.runs) and not output.final,
+        guardian_active=relief.found and not output.final,
     )
 
 
-def _earlier_run(holds: Sequence[str]) -> tuple[bool, GuardianRelief]:
-    """Return whether a run of the device has died, and the relief of its guardian.
+def _earlier_runs(holds: Sequence[str]) -> tuple[bool, GuardianRelief]:
+    """Return whether a run of the device died, and the relief of guardians.
 
     A dead run may have left an unanswered command.
     """
     try:
-        died = any(not run.supervised and set(run.card.holds) & set(holds) for run in runs())
-        return died, GuardianRelief(holds)
+        relief = GuardianRelief(holds)
+        return relief.found, relief
     except RunError as error:
         _log.warning("%s: the safe value is written anyway", error)
         return True, GuardianRelief(())
 
 
-def _locks(stack: ExitStack, holds: Sequence[str]) -> list[int]:
-    """Lock a device; return the descriptors of its locks, none if they cannot be created."""
+def _acquire(stack: ExitStack, holds: Sequence[str], relief: GuardianRelief) -> None:
+    """Acquire the locks of a device until the end of a stack, or none if they cannot be created."""
     try:
-        return stack.enter_context(held_devices(holds))
+        # Another user must not prevent the safe value.
+        relief.acquire(stack.enter_context(DeviceLocks(holds, take_over=True)))
     except RunError as error:  # such as a full /dev/shm: the output must become safe nevertheless
         _log.warning("%s: the safe value is written anyway", error)
-        return []
 
 
-def _drive(
-    output: SafeOutput, clock: Callable[[], float], sleep: Callable[[float], None], *, watches: bool
-) -> None:
-    """Write until the state is final, a time limit, or Ctrl-C; watched values are repeated."""
+def _drive(output: SafeOutput, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
+    """Write until the state is final or set, a time limit, or Ctrl-C."""
     give_up_s = clock() + PATIENCE_S
-    try:
+    with suppress(KeyboardInterrupt):
         while True:
             try:
                 output.attempt()
             except LocalError as error:
                 output.error = str(error)
-            now_s = clock()
-            if output.final or (output.state == "set" and not watches):
-                return
-            if now_s >= give_up_s + (HOLD_S if output.state == "set" else 0.0):
+            if output.final or output.state == "set" or clock() >= give_up_s:
                 return
             sleep(output.pause_s)
-    except KeyboardInterrupt:
-        return

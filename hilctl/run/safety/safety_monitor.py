@@ -3,13 +3,15 @@
 The guardian acts by itself if the loop dies or hangs. The supervisor restarts a lost guardian, and
 sets the safe value itself if no guardian can: for a simulated device, or if the guardian died,
 hangs, or cannot drive the device. It kills the guardian first, so that only one process holds the
-device. An output that is not confirmed at the end of the run is left to a guardian.
+device. Another guardian then waits: it acts if the supervisor dies, and an output that is not
+confirmed at the end of the run is left to it.
 """
 
 import time
 from collections.abc import Callable
 from contextlib import suppress
 from functools import partial
+from typing import Literal, TypeAlias
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
@@ -27,16 +29,20 @@ _LOST_NS = 1_000_000_000
 _LOST_LOOKS = 3
 _START_NS = 60_000_000_000
 _AGAIN_NS = 5_000_000_000
+_REPEAT_NS = 500_000_000
 _HAND_OVER_S = 10.0
 _POLL_S = 0.01
+
+
+StartGuardian: TypeAlias = Callable[[int | Literal["act"]], GuardianProcess]
 
 
 class SafetyMonitor:
     """Ensure a safe output after a loop that died or hangs.
 
     Args:
-        start_guardian: Starts a guardian that watches a process, or acts immediately if None; None
-            if the run needs no guardian.
+        start_guardian: Starts a guardian that watches a process or, with "act", acts if the
+            supervisor does not; None if the run needs no guardian.
     """
 
     def __init__(
@@ -44,7 +50,7 @@ class SafetyMonitor:
         checked: CheckedExperiment,
         ring: SampleRing,
         child: LoopProcess,
-        start_guardian: Callable[[int | None], GuardianProcess] | None,
+        start_guardian: StartGuardian | None,
         record_event: Callable[[Event], None],
     ) -> None:
         self._ring, self._page, self._child = ring, ring.page, child
@@ -61,6 +67,7 @@ class SafetyMonitor:
         self._trouble_ns = 0
         self._hung = False
         self._action: SafeAction | None = None
+        self._acted_ns = 0
         self.result: SafeActionResult | None = None
         """Final result; None while no action was necessary or the action continues."""
         self.by = ""
@@ -98,16 +105,18 @@ class SafetyMonitor:
     def _follow_up(self, now_ns: int, *, ended: bool) -> None:
         """Follow the process that drives the device; drive it here if the guardian does not."""
         action = self._action
-        if action is None and not self._guardian_acts(now_ns):
+        again = action is not None and action.failed and now_ns - self._acted_ns > _REPEAT_NS
+        if again or (action is None and not self._guardian_acts(now_ns)):
+            self._acted_ns = now_ns
             be_quick(self._priority)
             try:
                 self._stand_in()
             finally:
                 be_ordinary()
-        elif action is not None and action.failed:
-            self._action = None  # retried at the next poll
         by, result = self._reached()
         over = now_ns - self._trouble_ns > self._patience_ns
+        if over and result is None:
+            result = SafeActionResult(self._hung, "unknown", "no process could act", final=False)
         # A loop that was killed in a system call ends later.
         gone = ended or self._action is not None
         # A guardian watches a value that is set but not confirmed.
@@ -121,20 +130,25 @@ class SafetyMonitor:
         return "guardian", self._page.safe_result()
 
     def _stand_in(self) -> None:
+        """Drive the device here, and have a guardian wait."""
+        page, guardian = self._page, self._guardian
+        page.put(PageField.STANDS_IN, 1)
         # Both before the device is used: neither may write to it afterwards.
         last_call_s = 1e-3 * LAST_CALL_MS
-        if self._guardian is not None:
-            self._guardian.kill(last_call_s)
+        if guardian is not None and guardian.phase != GuardianPhase.WAITING:
+            guardian.kill(last_call_s)
         self._child.kill(last_call_s)
         # The guardian may have finished just before.
-        result = self._page.safe_result()
-        if result is None or not result.final:
-            limits = self._limits
-            goal = safe_goal(self._ring, self._device, limits.safe, limits.ramp_per_s)
-            prepare = partial(be_quick, self._priority)
-            self._action = SafeAction(
-                self._page, self._device, goal, hung=self._hung, prepare=prepare
-            )
+        result = page.safe_result()
+        if result is not None and result.final:
+            return
+        limits = self._limits
+        goal = safe_goal(self._ring, self._device, limits.safe, limits.ramp_per_s)
+        prepare = partial(be_quick, self._priority)
+        self._action = SafeAction(page, self._device, goal, hung=self._hung, prepare=prepare)
+        if self._start_guardian is not None and (guardian is None or guardian.ended):
+            with suppress(OSError):  # no memory or descriptors: it is tried again
+                self._guardian = self._start_guardian("act")
 
     def _guardian_acts(self, now_ns: int) -> bool:
         guardian = self._guardian
@@ -185,31 +199,35 @@ class SafetyMonitor:
         """End the guardian, or leave an unconfirmed output to it; return whether it stays."""
         if self.result is None or self.result.final or self._start_guardian is None:
             if self._guardian is not None:
+                self._page.put(PageField.RELIEVED, 1)
                 self._guardian.end()
             return False
         if self._action is None:
             return self._guardian is not None and not self._guardian.ended
-        return self._hand_over(stopped)
+        return self._hand_over(self._action, stopped)
 
-    def _hand_over(self, stopped: Callable[[], bool]) -> bool:
-        """Hand an unconfirmed output over to a new guardian; continue here until that works."""
-        while self._action is not None and not stopped():
-            self._action.end(_HAND_OVER_S)
-            if self._started_to_act(stopped):
-                return True
-            with suppress(RuntimeError):  # no thread can be started: retried
-                self._stand_in()
-            deadline_s = time.monotonic() + _HAND_OVER_S
-            while time.monotonic() < deadline_s and not stopped() and not self._action.failed:
-                self.result = self._action.result(_POLL_S)
-                if self.result.final:
-                    return False
+    def _hand_over(self, action: SafeAction, stopped: Callable[[], bool]) -> bool:
+        """Hand an unconfirmed output over to the guardian; continue here until that works.
+
+        Return False if the output is confirmed, at a stop, or if no process can act.
+        """
+        give_up_s = time.monotonic() + _HAND_OVER_S
+        while not stopped() and not (action.failed and time.monotonic() > give_up_s):
+            guardian = self._guardian
+            if guardian is not None and guardian.phase == GuardianPhase.WAITING:
+                while not action.end(_POLL_S):
+                    pass  # the last write ends after the timeout of the device
+                self._device.close()
+                self._page.put(PageField.STANDS_IN, 0)
+                if guardian.await_acting(stopped):
+                    return True
+            if action.is_over or guardian is None or guardian.ended:
+                time.sleep(_REPEAT_NS * 1e-9)
+                with suppress(RuntimeError):  # no thread can be started: retried
+                    self._stand_in()
+                action = self._action or action
+            self.result = action.result(_POLL_S)
+            if self.result.final:
+                self._page.put(PageField.RELIEVED, 1)
+                return False
         return False
-
-    def _started_to_act(self, stopped: Callable[[], bool]) -> bool:
-        assert self._start_guardian is not None
-        try:
-            guardian = self._guardian = self._start_guardian(None)
-        except OSError:
-            return False
-        return guardian.await_acting(stopped)

@@ -99,6 +99,11 @@ class PageField(IntEnum):
     GUARDIAN_PID = 76
     SAFE_WRITES = 77
     LAST_SAFE_WRITE = 78
+    AWAITS_DEVICE = 79
+    HAS_DEVICE = 80
+    CLAIM = 81
+    RELIEVED = 82
+    STANDS_IN = 83
 
 
 class Phase(IntEnum):
@@ -121,6 +126,7 @@ class GuardianPhase(IntEnum):
     ACTING = 2
     DONE = 3
     FAILED = 4
+    WAITING = 5  # another process has the device; the guardian acts if that process ends
 
 
 @dataclass(frozen=True, slots=True)
@@ -136,6 +142,9 @@ class SafeActionResult:
     def confirmed(self) -> bool:
         """Whether the device confirmed the safe value."""
         return self.output == "confirmed"
+
+
+_ACTED = {GuardianPhase.ACTING, GuardianPhase.WAITING, GuardianPhase.DONE}
 
 
 class Stop(IntEnum):
@@ -306,7 +315,7 @@ class SharedPage:
 
     def safe_result(self) -> SafeActionResult | None:
         """Return the guardian's result so far; None if it has not acted."""
-        if self.get(PageField.GUARDIAN_PHASE) not in {GuardianPhase.ACTING, GuardianPhase.DONE}:
+        if self.get(PageField.GUARDIAN_PHASE) not in _ACTED:
             return None
         for _ in range(_READS):  # the guardian may be writing it
             with suppress(ValueError, TypeError):

@@ -7,7 +7,6 @@ import pytest
 
 from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl.loop.safe_output import (
-    HOLD_S,
     PATIENCE_S,
     LocalError,
     SafeGoal,
@@ -84,50 +83,32 @@ def test_without_a_last_command_there_is_no_ramp():
 def test_it_is_set_within_one_retry_of_the_return_of_the_device(down_s):
     amplifier = Amplifier()
     amplifier.down_until_s = amplifier.now_s + down_s
-    assert driven(amplifier, until_s=1e4).state == "confirmed"  # after it has held
+    driven(amplifier, until_s=amplifier.down_until_s + 2.0)
     (at_s, value), *_ = amplifier.writes
     assert value == 0.0
-    assert at_s <= amplifier.down_until_s + 0.51
+    assert at_s <= amplifier.down_until_s + (0.51 if down_s < 60.0 else 1.01)
 
 
-@pytest.mark.parametrize("late_s", [0.1, 1.3, 2.5, 10.0, 25.0])
-def test_confirmed_is_not_said_before_an_older_command_may_be_executed(late_s):
+@pytest.mark.parametrize("late_s", [0.1, 10.0, 34.0, 600.0])
+def test_an_older_command_that_is_executed_late_is_corrected_within_one_repeat(late_s):
     amplifier = Amplifier(older=(100.0 + late_s, -4.0))
-    output = driven(amplifier, pending=True)
-    assert (output.state, amplifier.older, amplifier.output) == ("confirmed", None, 0.0)
-    assert amplifier.now_s >= 100.0 + HOLD_S
+    output = driven(amplifier, until_s=101.1 + late_s, pending=True)
+    assert (output.state, amplifier.older, amplifier.output) == ("set", None, 0.0)
 
 
-def test_a_value_of_the_ramp_without_answer_may_be_executed_late_too():
+def test_a_ramp_value_without_answer_may_be_executed_late_too():
     amplifier = Amplifier(older=(102.3, 3.0))
     amplifier.down_until_s = amplifier.now_s + 1.0
-    output = driven(amplifier)
-    assert (output.state, amplifier.older, amplifier.output) == ("confirmed", None, 0.0)
-    assert amplifier.now_s >= 101.0 + HOLD_S
+    output = driven(amplifier, until_s=103.0)
+    assert (output.state, amplifier.older, amplifier.output) == ("set", None, 0.0)
 
 
-def test_until_then_it_is_set_and_repeated():
+def test_an_older_command_is_never_confirmed_not_to_follow():
     amplifier = Amplifier()
-    output = driven(amplifier, until_s=110.0, start=None, pending=True)
+    output = driven(amplifier, until_s=1e4, start=None, pending=True)
     assert (output.state, output.final) == ("set", False)
-    assert len(amplifier.writes) > 10
-
-
-def test_a_silence_starts_the_time_again():
-    amplifier = Amplifier()
-    goal = SafeGoal(0.0, 20.0, None, pending=True)
-    output = SafeOutput(amplifier, goal, amplifier.clock)
-    output.attempt()
-    amplifier.sleep(HOLD_S - 1.0)
-    amplifier.down_until_s = amplifier.now_s + 1.0
-    output.attempt()
-    assert (output.state, output.error) == ("unknown", "no answer")
-    amplifier.sleep(2.0)
-    output.attempt()
-    assert output.state == "set"
-    amplifier.sleep(HOLD_S)
-    output.attempt()
-    assert output.state == "confirmed"
+    times = [at_s for at_s, _ in amplifier.writes]
+    assert times[1] - times[0] < 0.5 < times[-1] - times[-2] < 1.5
 
 
 def test_a_device_that_cannot_confirm_is_sent_the_value_several_times():

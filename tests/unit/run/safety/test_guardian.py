@@ -7,7 +7,7 @@ import subprocess
 import sys
 import threading
 import time
-from contextlib import suppress
+from contextlib import contextmanager, suppress
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -17,6 +17,7 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl.loop.safe_output import LoopOutcome, SafeGoal
 from hilctl.run.job import Job, SilenceLimits
+from hilctl.run.run_folder import DeviceLocks
 from hilctl.run.safety import guardian
 from hilctl.run.safety.guardian import (
     LAST_CALL_MS,
@@ -39,15 +40,17 @@ from tests.fakes import FakeInfo
 
 SLEEP = [sys.executable, "-c", "import time; time.sleep(600)"]
 DESCRIPTORS = Path("/proc/self/fd")
+HOLDS = f"tcp:10.9.8.7:{os.getpid()}"
 IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 
 
 JOB_LIMITS = SilenceLimits(1.0, 1.0, 1.0, 1.0)
 
 
-def job_of(experiment, *, ring="", limits=JOB_LIMITS):
+def job_of(experiment, *, ring="", limits=JOB_LIMITS, locks=()):
     return Job(
-        experiment=experiment, files={}, folder="", ring=ring, reference="", input_um="",
+        experiment=experiment, files={}, folder="", ring=ring, holds=[HOLDS] if locks else [], locks=[*locks],
+        reference="", input_um="",
         state=None, heat_a2=0.0, stands_um=None, segments=[], adapted=None, safe_value=0.25,
         ramp_per_s=50.0, limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
     )  # fmt: skip
@@ -69,8 +72,27 @@ class Device:
             raise self.error
 
 
+@contextmanager
+def ended_after(device, calls):
+    """Have the user end the guardian in a call of its device; wait for its thread afterwards."""
+    make_safe, made = device.make_safe, []
+
+    def ending(value):
+        made.append(value)
+        if len(made) == calls:
+            os.kill(os.getpid(), signal.SIGTERM)
+        make_safe(value)
+
+    device.make_safe = ending
+    yield made
+    device.make_safe = make_safe
+    for thread in threading.enumerate():
+        if thread.name == "safe action":
+            thread.join(10.0)
+
+
 @pytest.fixture
-def guarded(tmp_path, monkeypatch):
+def guarded(tmp_path):
     """A process that stands for the loop, and a function that guards it until it is gone."""
     loop = subprocess.Popen(SLEEP)
     ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
@@ -83,11 +105,14 @@ def guarded(tmp_path, monkeypatch):
     before = signal.getsignal(signal.SIGTERM)
     made = SimpleNamespace(loop=loop, page=page, ring=ring, device=Device(loop), pidfd=pidfd)
 
-    monkeypatch.setattr("hilctl.loop.safe_output.HOLD_S", 0.0)
-
     def guard(hang_s=60.0):
         limits = SilenceLimits(hang_s, hang_s, 60.0, hang_s)
-        return Guardian(ring, made.device, job_of("", limits=limits), pidfd, loop.pid).watch()
+        with DeviceLocks([HOLDS]) as locks:
+            locks.acquire()
+            job = job_of("", limits=limits, locks=[os.dup(each) for each in locks.descriptors])
+        watcher = Guardian(ring, made.device, job)
+        watcher.watch(pidfd, loop.pid)
+        watcher._locks.close()
 
     made.guard = guard
     yield made
@@ -104,17 +129,25 @@ def gave_up(page, output):
 @pytest.mark.parametrize("left", [
     lambda page: None,
     lambda page: page.put(PageField.PHASE, Phase.FAILED),
-    lambda page: gave_up(page, "unknown"),
-    lambda page: gave_up(page, "set"),
-], ids=["died", "broke", "unknown", "set"])  # fmt: skip
+], ids=["died", "broke"])  # fmt: skip
 def test_a_loop_without_a_safe_output_is_followed_by_the_safe_value(guarded, left):
-    """What it tried itself may not have been confirmed."""
     left(guarded.page)
     guarded.loop.kill()
-    assert guarded.guard()
+    guarded.guard()
     assert [value for value, _ in guarded.device.asked] == [0.25]
     assert guarded.page.safe_result().confirmed
     assert not guarded.page.safe_result().hung
+
+
+@pytest.mark.parametrize("output", ["unknown", "set"])
+def test_a_loop_that_ended_without_a_confirmed_output_leaves_a_watch(guarded, output):
+    """A command of the loop may still be executed, so that only the user ends the guardian."""
+    gave_up(guarded.page, output)
+    guarded.loop.kill()
+    with ended_after(guarded.device, calls=3):
+        guarded.guard()
+    assert guarded.page.safe_result() == SafeActionResult(False, "set", "", final=False)
+    assert guarded.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.DONE
 
 
 @pytest.mark.parametrize("how", ["stopped", "silent"])
@@ -125,7 +158,8 @@ def test_a_loop_that_hangs_is_killed_before_the_device_is_touched(guarded, how):
         guarded.page.put(PageField.EXCHANGING, 1)
         guarded.loop.send_signal(signal.SIGSTOP)
         os.waitid(os.P_PID, guarded.loop.pid, os.WSTOPPED | os.WNOWAIT)
-    guarded.guard(hang_s=0.03)
+    with ended_after(guarded.device, calls=1):
+        guarded.guard(hang_s=0.03)
     assert guarded.device.asked == [(0.25, False)]
     assert guarded.loop.wait() == -signal.SIGKILL
     assert guarded.page.safe_result().hung
@@ -187,7 +221,7 @@ def test_a_loop_that_is_stopped_after_its_end_is_killed_only(guarded):
     guarded.page.leave_outcome(LoopOutcome("completed", "completed", 7, "confirmed", 0))
     guarded.loop.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, guarded.loop.pid, os.WSTOPPED | os.WNOWAIT)
-    assert guarded.guard(hang_s=0.03)
+    guarded.guard(hang_s=0.03)
     assert guarded.device.asked == []
     assert guarded.loop.wait() == -signal.SIGKILL
 
@@ -203,7 +237,7 @@ def test_a_loop_that_died_before_the_start_has_moved_nothing(guarded):
 def test_the_way_is_a_ramp_from_the_last_command(guarded):
     guarded.page.put_float(PageField.OUTPUT_AT_START, 1.25)
     guarded.loop.kill()
-    assert guarded.guard()
+    guarded.guard()
     values = [value for value, _ in guarded.device.asked]
     assert values[0] == pytest.approx(1.0)
     assert values == sorted(values, reverse=True)
@@ -220,35 +254,95 @@ def test_a_ramp_that_another_process_began_is_gone_on_with(guarded):
 
 
 def test_it_keeps_trying_until_the_user_ends_it(guarded):
-    tries, confirmed = [], guarded.device.make_safe
-
-    def make_safe(value):
-        tries.append(value)
-        if len(tries) == 3:
-            os.kill(os.getpid(), signal.SIGTERM)
-        raise DeviceError("no answer")
-
-    guarded.device.make_safe = make_safe
+    guarded.device.error = DeviceError("no answer")
     guarded.loop.kill()
-    assert guarded.guard()
+    with ended_after(guarded.device, calls=3) as tries:
+        guarded.guard()
     assert len(tries) >= 3
     assert "no answer" in guarded.page.safe_result().error
     assert not guarded.page.safe_result().final
-    guarded.device.make_safe = confirmed  # ends the thread, which would end with its process
-    for thread in threading.enumerate():
-        if thread.name == "safe action":
-            thread.join()
 
 
 @pytest.mark.parametrize("error", [MemoryError(), ZeroDivisionError("a bug")])
-def test_a_guardian_that_cannot_drive_the_device_says_so_and_ends(guarded, error):
-    """The supervisor tries then, which may be able to."""
+def test_a_guardian_that_cannot_drive_the_device_says_so_and_tries_again(
+    guarded, monkeypatch, error
+):
+    """The supervisor drives the device then, unless it has died too."""
+    monkeypatch.setattr(guardian, "_AGAIN_S", 0.0)
+    said, write_text = [], guarded.page.write_text
+
+    def noted(place, text):
+        write_text(place, text)
+        said.append(text)
+
+    guarded.page.write_text = noted
     guarded.device.error = error
     guarded.loop.kill()
-    assert not guarded.guard()
-    assert guarded.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.FAILED
-    assert guarded.page.safe_result() is None
-    assert type(error).__name__ in guarded.page.read_text(PageSlot.GUARDIAN)
+    with ended_after(guarded.device, calls=2) as tries:
+        guarded.guard()
+    assert len(tries) >= 2
+    assert any(text.startswith(type(error).__name__) for text in said)
+
+
+@pytest.fixture
+def claimed(guarded, monkeypatch):
+    """Locks of another command, which claims the device in its first write and acquires it."""
+    monkeypatch.setattr(guardian, "_CLAIM_S", 0.0)
+    device, make_safe, release = guarded.device, guarded.device.make_safe, DeviceLocks.release
+    closed = []
+
+    def claiming(value):
+        guarded.page.put(PageField.CLAIM, not closed)
+        make_safe(value)
+
+    def released(locks):
+        assert closed
+        device.error = None
+        release(locks)
+        other.acquire()
+        other.then()
+        release(other) if other.ends else None
+
+    monkeypatch.setattr(DeviceLocks, "release", released)
+    device.error, device.make_safe = DeviceError("no answer"), claiming
+    device.close = lambda: closed.append(True)
+    guarded.loop.kill()
+    with DeviceLocks([HOLDS]) as other:
+        yield other
+
+
+def test_a_claimed_device_is_driven_again_if_the_other_command_ends(guarded, claimed):
+    """The locks decide; the ramp begins where the other command left the output."""
+    claimed.then, claimed.ends = lambda: guarded.page.note_safe_write(0.5), True
+    guarded.guard()
+    assert guarded.page.safe_result().confirmed
+    values = [value for value, _ in guarded.device.asked]
+    assert max(values) < 0.5
+    assert values[-1] == 0.25
+
+
+def test_a_relieved_guardian_ends_and_leaves_the_device_alone(guarded, claimed):
+    claimed.then, claimed.ends = lambda: guarded.page.put(PageField.RELIEVED, 1), False
+    guarded.guard()
+    assert claimed.holder() == ""
+    assert guarded.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.DONE
+    assert not guarded.page.safe_result().final
+
+
+def test_a_guardian_stands_by_while_the_supervisor_acts(guarded, monkeypatch):
+    monkeypatch.setattr(guardian, "_WAIT_S", 0.0)
+    page, waits = guarded.page, []
+    page.put(PageField.STANDS_IN, 1)
+    monkeypatch.setattr(guardian.os, "getppid", lambda: 2 if len(waits) < 3 else 1)
+
+    def beat(self):
+        waits.append(guarded.device.asked[:])
+
+    monkeypatch.setattr(Guardian, "_beat", beat)
+    guarded.loop.kill()
+    Guardian(guarded.ring, guarded.device, job_of("")).act(hung=False)
+    assert waits[:3] == [[], [], []]
+    assert page.safe_result().confirmed
 
 
 def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded, monkeypatch):
@@ -265,7 +359,6 @@ def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded, monkeypatch):
     def make_safe(value):
         while len(seen) < 3:
             seen.add(guarded.page.get(PageField.GUARDIAN_HEARTBEAT_NS))
-            assert guarded.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.ACTING
             time.sleep(0.0)
         go_on.set()
 
@@ -333,6 +426,7 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
     assert done == ["frozen", *locked, (7, "MainThread"), (7, "safe action")]
     for number in (signal.SIGINT, signal.SIGHUP):  # SIGTERM ends an action that goes on
         assert signal.getsignal(number) == signal.SIG_IGN
+    signal.signal(signal.SIGTERM, signal.SIG_IGN)  # its handler keeps the ring
     assert set(DESCRIPTORS.iterdir()) <= descriptors
 
 

@@ -92,7 +92,7 @@ def test_no_room_for_a_lock_is_no_reason_to_leave_current_flowing(
     (tmp_path / "runs").write_text("")
     monkeypatch.setenv("HILCTL_RUNS", str(tmp_path / "runs"))
     found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
-    assert (found["output_safe"], set(amplifier.asked)) == (True, {0.5})
+    assert (found["output_state"], set(amplifier.asked)) == ("set", {0.5})
     assert caplog.messages
 
 

@@ -44,7 +44,11 @@ class Run:
         self.page, self.log, self.events, self.guardians = page, [], [], []
         self.now_ns, self.fail_start, self.error = 10**9, None, None
         self.watched = []
-        device = SimpleNamespace(info=FakeInfo(simulated=simulated), make_safe=self.make_safe)
+        device = SimpleNamespace(
+            info=FakeInfo(simulated=simulated),
+            make_safe=self.make_safe,
+            close=lambda: self.log.append("closed"),
+        )
         timing = SimpleNamespace(hang_s=None, max_late_s=1.0)
         config = SimpleNamespace(
             timing=timing,
@@ -140,6 +144,7 @@ def test_where_the_guardian_can_not_the_supervisor_does(run, what):
     assert run.settle() == SafeActionResult(hung=False, output="confirmed")
     assert run.log == ["guardian killed", "loop killed", "safe 0.25"]
     assert run.safety.by == "supervisor"
+    assert run.watched == [1, "act"], "another guardian waits"
     assert guardian.waited_s == run.waited_s == pytest.approx(1e-3 * LAST_CALL_MS, rel=1e-6)
     # Both threads that do it stand before the loop, and one of them goes back.
     assert sorted(run.priorities) == [0, 81, 81]
@@ -194,26 +199,41 @@ def unconfirmed(run):
     return run
 
 
-def test_what_the_supervisor_cannot_confirm_is_left_to_a_new_guardian(unconfirmed):
-    def start(watched):
-        guardian = unconfirmed.start(watched)
-        guardian.phase = GuardianPhase.ACTING
-        return guardian
+def test_what_the_supervisor_cannot_confirm_is_left_to_the_waiting_guardian(unconfirmed, page):
+    guardian = unconfirmed.guardians[-1]
+    assert unconfirmed.watched == [1, "act"]
+    assert page.get(PageField.STANDS_IN)
+    guardian.phase = GuardianPhase.WAITING
 
-    unconfirmed.safety._start_guardian = start
+    def await_acting(stopped):
+        assert not page.get(PageField.STANDS_IN)
+        assert unconfirmed.log[-1] == "closed"
+        return True
+
+    guardian.await_acting = await_acting
     assert unconfirmed.safety.close()
-    assert unconfirmed.watched == [1, None]
-    assert not unconfirmed.safety._action._thread.is_alive()
+    assert unconfirmed.safety._action.is_over
 
 
 @pytest.mark.parametrize("ended", [False, True])
 def test_if_no_guardian_can_be_started_the_supervisor_goes_on_until_the_user_ends_it(
-    unconfirmed, ended
+    unconfirmed, ended, monkeypatch
 ):
+    monkeypatch.setattr(module, "_REPEAT_NS", 0)
+    unconfirmed.guardians[-1].ended = True
     unconfirmed.fail_start = OSError(24, "Too many open files")
     unconfirmed.error = unconfirmed.error if ended else None
     assert not unconfirmed.safety.close(lambda: ended)
     assert unconfirmed.safety.result.confirmed != ended
+
+
+def test_if_no_process_can_act_the_run_ends(unconfirmed, monkeypatch):
+    monkeypatch.setattr(module, "_HAND_OVER_S", 0.0)
+    monkeypatch.setattr(module, "_REPEAT_NS", 0)
+    unconfirmed.guardians[-1].ended = True
+    unconfirmed.fail_start, unconfirmed.error = OSError(24, "Too many open files"), MemoryError()
+    assert not unconfirmed.safety.close()
+    assert unconfirmed.safety.result.output == "unknown"
 
 
 def test_a_simulated_device_has_no_guardian(ring, monkeypatch):
