@@ -1,12 +1,14 @@
 """A device that is gone when its loop ends: its guardian goes on, and others can relieve it."""
 
 import json
+import signal
 import time
+from pathlib import Path
 
 import pytest
 
 from tests.commands import hilctl
-from tests.faults.conftest import MODULE
+from tests.faults.conftest import MODULE, Emulated, tcp
 
 AWAY_S = 2.0
 PULLED_AT = 80
@@ -23,16 +25,21 @@ def active():
 
 
 class Module:
-    """An emulated module that is pulled in mid-run, and another one that takes its place."""
+    """An emulated module that is pulled in mid-run, and another one that takes its place.
 
-    def __init__(self, folder, emulate, profile):
-        self.port, self._emulate, self._profile = folder / "port", emulate, profile
-        self.port.symlink_to(emulate(profile, "--fault", f"unplug@{PULLED_AT}").address)
+    On TCP, because a new pseudo-terminal is another device: only an address stays.
+    """
+
+    def __init__(self, emulate, profile):
+        self._emulate, self._profile = emulate, profile
+        words = ("--link", "rtu_tcp", "--fault", f"unplug@{PULLED_AT}")
+        self.emulated = emulate(profile, *words)
+        self.place = tcp(self.emulated.address)
 
     def come_back(self):
-        self.emulated = self._emulate(self._profile)
-        self.port.unlink()
-        self.port.symlink_to(self.emulated.address)
+        self.emulated.end()
+        words = ("--link", "rtu_tcp", "--port", str(self.place["tcp_port"]))
+        self.emulated = self._emulate(self._profile, *words)
 
     def writes_a(self):
         return [each["current_a"] for each in self.emulated.log.events("OUT")]
@@ -45,10 +52,10 @@ class Module:
 
 
 @pytest.fixture
-def abandoned(tmp_path, emulate, run, profile):
+def abandoned(emulate, run, profile):
     """Return a module that was pulled in mid-run, with the result of the run."""
-    module = Module(tmp_path, emulate, profile("rtu_module"))
-    section = {**MODULE, "profile": profile("rtu_module"), "serial_port": str(module.port)}
+    module = Module(emulate, profile("rtu_module"))
+    section = {**MODULE, "profile": profile("rtu_module"), **module.place, "framing": "rtu"}
     started = run({**section, "timeout_s": 0.5}, sample_rate_hz=100)
     module.result = started.end()
     module.experiment = started.output.with_suffix(".yaml")
@@ -101,3 +108,50 @@ def test_the_user_can_end_the_guardian(abandoned):
     (run,) = active()
     assert said("stop", "--run", run["name"])["ended"]
     assert all(run["state"] != "setting the safe value" for run in active())
+
+
+@pytest.fixture
+def on_a_port(tmp_path, emulate, run, profile):
+    """Return a function that starts a run on a module's port, or on a link to it."""
+
+    def start(*faults, link):
+        device = emulate(profile("rtu_module"), *faults)
+        port = tmp_path / "port" if link else Path(device.address)
+        if link:
+            port.symlink_to(device.address)
+        section = {**MODULE, "profile": profile("rtu_module"), "serial_port": str(port)}
+        return device, port, run({**section, "timeout_s": 0.5}, sample_rate_hz=100)
+
+    return start
+
+
+def test_the_guardian_writes_nothing_to_another_device(on_a_port, tmp_path, profile):
+    """A link that leads to another board by now: its output is not ours."""
+    _, port, started = on_a_port("--fault", f"unplug@{PULLED_AT}", link=True)
+    assert started.end()["guardian_active"]
+    (tmp_path / "other").mkdir()
+    other = Emulated(tmp_path / "other", profile("rtu_module"), "--current-a", "2.0")
+    try:
+        port.unlink()
+        port.symlink_to(other.address)
+        deadline = time.monotonic() + 30.0
+        while "another device" not in active()[0]["error"]:
+            assert time.monotonic() < deadline
+            time.sleep(0.05)
+        time.sleep(AWAY_S)
+        assert other.log.writes("OUT") == []
+    finally:
+        other.end()
+
+
+def test_a_port_whose_mode_changes_meanwhile_is_the_same(on_a_port):
+    """Plugged in again, a port gets its owner and mode by udev."""
+    device, port, started = on_a_port(link=False)
+    device.log.await_events("OUT", PULLED_AT, started.process)
+    device.process.send_signal(signal.SIGSTOP)
+    try:
+        assert started.end()["guardian_active"]
+        port.chmod(0o660)
+    finally:
+        device.process.send_signal(signal.SIGCONT)
+    device.log.await_output("OUT", 0.0)

@@ -9,9 +9,6 @@ process:
 - on a real port that no other program has open, as far as this process can see;
 - on a pseudo-terminal, which its far end keeps, only if this process could open it all the same.
 
-A path such as ``/dev/ttyUSB0`` leads to another device once the first is unplugged. A process that
-retries the safe value must not send it there, so a port has an identity besides its path.
-
 Between experiments one device is one lock, see :attr:`hilctl.base.device.DeviceInfo.holds`. So each
 place has all the names that another experiment could use: a port its path, the target of its links
 and its device number, a host its name and its addresses.
@@ -26,9 +23,7 @@ from functools import cache
 from pathlib import Path
 from threading import Thread
 
-from serial.tools.list_ports import comports
-
-_PTY_MAJORS = range(136, 144)
+from hilctl_drivers.transport.port_identity import PTY_MAJORS
 
 
 def refuse_to_others(descriptor: int, path: str) -> bool:
@@ -37,7 +32,7 @@ def refuse_to_others(descriptor: int, path: str) -> bool:
     ``path`` is its device file.
     """
     device = os.fstat(descriptor).st_rdev
-    is_pty = os.major(device) in _PTY_MAJORS
+    is_pty = os.major(device) in PTY_MAJORS
     if not is_pty and others_have(device):
         return False
     if not _set(descriptor, on=True):
@@ -84,27 +79,6 @@ def _can_open(path: str) -> bool:
     except OSError:
         return False
     return True
-
-
-def port_identity(path: str) -> str:
-    """Return what a port leads to, whatever its path; empty if that cannot be told.
-
-    A USB adapter is known by vendor, product and serial number, or by its socket if it has no
-    number; a pseudo-terminal by when it was made, unless a link, which its owner moves, leads to
-    it.
-    """
-    real = Path(path).resolve()
-    try:
-        status = real.stat()
-    except OSError:
-        return ""
-    if os.major(status.st_rdev) in _PTY_MAJORS:
-        return "" if Path(path).is_symlink() else f"pseudo-terminal of {status.st_ctime_ns}"
-    for port in comports():
-        if port.device == str(real) and port.vid is not None:
-            number = f"number {port.serial_number}" if port.serial_number else port.location
-            return f"USB {port.vid:04x}:{port.pid:04x}, {number}"
-    return ""
 
 
 _LOOKUP_S = 1.0

@@ -14,7 +14,8 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.files import PORT_REMEDIES, reason
 from hilctl_drivers.profile_base import SerialLineSettings
 from hilctl_drivers.transport.links import LostError
-from hilctl_drivers.transport.resource_names import admit_others, port_identity, refuse_to_others
+from hilctl_drivers.transport.port_identity import PortIdentity
+from hilctl_drivers.transport.resource_names import admit_others, refuse_to_others
 from hilctl_drivers.transport.stream_link import StreamLink
 
 
@@ -84,25 +85,19 @@ class SerialLink(StreamLink):
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
         super().__init__(settings.silence_s, timeout_s, clock, sleep, echo=settings.removes_echo)
-        self._path = port
         self._settings = settings
         self._port: serial.Serial | None = None
         self._exclusive = False
         # Before the first opening: the guardian opens the port only after a run has failed.
-        self._identity = port_identity(port)
+        self._identity = PortIdentity(port)
 
     def open(self, *, boot: bool = True) -> None:
         """Open and lock the port, see :meth:`StreamLink.open`."""
         self.close()
-        found = port_identity(self._path)
-        self._identity = self._identity or found
-        if found not in {"", self._identity}:
-            raise LostError(
-                f"another device is at this port now ({found} instead of {self._identity}): name "
-                "the port by its link in /dev/serial/by-id, which stays with the device"
-            )
         try:
-            port = _open_port(self._path, self._settings, self.timeout_s)
+            # Not the path: a link may be moved in between.
+            file = self._identity.device_file()
+            port = _open_port(file, self._settings, self.timeout_s)
         except (OSError, ValueError) as error:
             text = reason(error, PORT_REMEDIES) if isinstance(error, OSError) else str(error)
             if self._settings.rs485 is not None and isinstance(error, ValueError):
@@ -114,7 +109,7 @@ class SerialLink(StreamLink):
         self._port = port
         self._use(port.fileno())
         if boot:
-            self._exclusive = refuse_to_others(self._fd, self._path)
+            self._exclusive = refuse_to_others(self._fd, file)
             self._stale = True
             self._sleep(self._settings.boot_wait_s)
         self._quiet_at = self._clock()

@@ -8,10 +8,9 @@ import threading
 from pathlib import Path
 
 import pytest
-from serial.tools.list_ports_common import ListPortInfo
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.transport import resource_names, serial_port, stream_link
+from hilctl_drivers.transport import resource_names, stream_link
 from hilctl_drivers.transport.links import LostError
 from hilctl_drivers.transport.resource_names import held_address, held_port
 from hilctl_drivers.transport.serial_port import SerialLink
@@ -50,7 +49,7 @@ def test_a_pty_is_refused_only_by_who_could_open_it_again(port, monkeypatch, may
 def test_a_real_port_is_refused_only_if_no_other_program_has_it(port, monkeypatch, others):
     """Its descriptor would keep what is asked for when this process is killed."""
     slave, path = port
-    monkeypatch.setattr(resource_names, "_PTY_MAJORS", ())
+    monkeypatch.setattr(resource_names, "PTY_MAJORS", ())
     monkeypatch.setattr(resource_names, "others_have", lambda device: others)
     assert resource_names.refuse_to_others(slave, path) is not others
     assert is_refused(slave) is not others
@@ -174,36 +173,3 @@ def test_a_port_is_known_by_its_number_too(line):
     number = f"tty:{os.major(rdev)}:{os.minor(rdev)}"
     assert held_port(path) == (f"serial:{path}", number)
     assert number in held_port(f"/proc/self/root{path}")
-
-
-def test_a_port_whose_path_leads_to_another_device_is_not_opened(line, monkeypatch):
-    """A guardian that retries would send its value to whatever was plugged in since."""
-    _, path = line
-    link = SerialLink(path, line_settings(), QUICK_S)
-    link.open()
-    link.open()
-    link.close()
-    monkeypatch.setattr(serial_port, "port_identity", lambda path: "another")
-    with pytest.raises(LostError, match="another device"):
-        link.open()
-
-
-@pytest.mark.parametrize(
-    ("now", "same"),
-    [
-        ({"serial_number": "A1", "location": "1-9"}, True),  # in another socket
-        ({"serial_number": "B2", "location": "1-4"}, False),
-        ({"serial_number": None, "location": "1-4"}, False),
-        ({"serial_number": "A1", "location": "1-4", "pid": 2}, False),
-    ],
-)
-def test_a_usb_adapter_is_known_by_its_number(monkeypatch, now, same):
-    def identity(given):
-        port = ListPortInfo(os.devnull)
-        values = {"vid": 0x0403, "pid": 1, **given}
-        for name, value in values.items():
-            setattr(port, name, value)
-        monkeypatch.setattr(resource_names, "comports", lambda: [port])
-        return resource_names.port_identity(os.devnull)
-
-    assert (identity({"serial_number": "A1", "location": "1-4"}) == identity(now)) is same

@@ -1,0 +1,82 @@
+"""Identity of a serial port: the device that its path led to first.
+
+A path such as ``/dev/ttyUSB0``, or a link, leads to another device once the first is unplugged. A
+process that retries the safe value must not send it there.
+"""
+
+import os
+from contextlib import suppress
+from pathlib import Path
+from weakref import finalize
+
+from hilctl_drivers.transport.links import LostError
+
+PTY_MAJORS = range(136, 144)
+
+
+class PortIdentity:
+    """The device that a port's path led to when it was first there.
+
+    A USB adapter is known by :func:`usb_adapter`, any other port by its device number. The number
+    of a closed pseudo-terminal is used again, so its file is kept too. Owner, mode and times, which
+    change while the device stays, do not count.
+    """
+
+    def __init__(self, path: str) -> None:
+        self._path = path
+        self._known = ""
+        self._pty = -1
+        with suppress(OSError):
+            self.device_file()
+
+    def device_file(self) -> str:
+        """Return the device file that the path leads to.
+
+        Raises:
+            OSError: There is none.
+            LostError: It leads to another device than the first time.
+        """
+        file = os.path.realpath(self._path)
+        device = Path(file).stat().st_rdev
+        found = usb_adapter(device) or f"device {os.major(device)}:{os.minor(device)}"
+        if not self._known:
+            if os.major(device) in PTY_MAJORS:
+                # Not opened for use. Its count of links becomes 0 when the pseudo-terminal ends.
+                self._pty = os.open(file, os.O_PATH)
+                finalize(self, os.close, self._pty)
+            self._known = found
+        ended = self._pty >= 0 and not os.fstat(self._pty).st_nlink
+        if ended or found != self._known:
+            raise LostError(
+                f"another device is at this port now ({found} instead of {self._known}"
+                f"{', which has ended' if ended else ''}): "
+                "name the port by its link in /dev/serial/by-id, which stays with the device"
+            )
+        return file
+
+
+def usb_adapter(device: int, sysfs: Path = Path("/sys")) -> str:
+    """Return the identity of the USB adapter that has a device number; empty if there is none.
+
+    Vendor, product, serial number, and which of the adapter's ports it is. An adapter without a
+    number is known by its socket.
+    """
+    number = f"{os.major(device)}:{os.minor(device)}"
+    port = (sysfs / "dev" / "char" / number / "device").resolve()
+    adapter = next((each for each in port.parents if (each / "idVendor").exists()), None)
+    if adapter is None:
+        return ""
+    vendor, product, serial = (
+        _text(adapter / name) for name in ("idVendor", "idProduct", "serial")
+    )
+    interface = port.relative_to(adapter).parts[0].rpartition(":")[2]
+    which = "-".join(filter(None, (interface, _text(port / "port_number"))))
+    place = f"number {serial}" if serial else f"at {adapter.name}"
+    return f"USB {vendor}:{product}, {place}, port {which}"
+
+
+def _text(attribute: Path) -> str:
+    """Return an attribute; empty if the device has none, OSError if it cannot be read now."""
+    if not attribute.exists():
+        return ""
+    return attribute.read_text(encoding="utf-8", errors="replace").strip()
