@@ -31,8 +31,9 @@ _RETRY_S = 0.05
 _LATER_RETRY_S = 0.5
 _REPEAT_S = 0.2
 PATIENT_AFTER_S = 60.0
-"""How long the safe value is repeated quickly; then once per second."""
-_PATIENT_S = 1.0
+"""How long the safe value is repeated quickly."""
+PATIENT_PAUSE_S = 1.0
+"""Pause between two attempts after that."""
 _SENDS = 5
 _OWN_ERRORS = {errno.EMFILE, errno.ENFILE, errno.ENOMEM, errno.ENOBUFS}
 
@@ -146,7 +147,10 @@ class SafeOutput:
         if self._began_s is None:
             self._began_s = now_s - _RAMP_S
         passed_s = now_s - self._began_s
-        value, least_s = self._value(passed_s), _PATIENT_S if passed_s > PATIENT_AFTER_S else 0.0
+        value, least_s = (
+            self._value(passed_s),
+            PATIENT_PAUSE_S if passed_s > PATIENT_AFTER_S else 0.0,
+        )
         confirmed = True
         self._on_write(value)
         try:

@@ -39,7 +39,8 @@ _LATE_TICKS, _STOP = int(PageField.LATE_TICKS), int(PageField.STOP)
 _SUPERVISOR_HEARTBEAT_NS = int(PageField.SUPERVISOR_HEARTBEAT_NS)
 _TUNE_WANTED, _TUNE_TAKEN = int(PageField.TUNE_WANTED), int(PageField.TUNE_TAKEN)
 _TUNE_BEGINS_AT = int(PageField.TUNE_BEGINS_AT)
-_SILENT_NS = 1_000_000_000
+_SILENCE_S = 1.0
+_POLL_S = 0.01
 
 
 class RingHost:
@@ -212,16 +213,22 @@ def main(words: list[str]) -> int:
     finally:
         if os.getppid() != job.supervisor:
             keep_removed()
-            _stand_in(words[0], job, ring.page)
+            _become_guardian(words[0], job, ring.page)
     return 0
 
 
-def _stand_in(path: str, job: Job, page: SharedPage) -> None:
+def _become_guardian(path: str, job: Job, page: SharedPage) -> None:
     """Become the guardian if this process is the last of a run whose output is not safe."""
-    silent_ns = time.monotonic_ns() - page.get(PageField.GUARDIAN_HEARTBEAT_NS)
-    if page.get(PageField.GO) and not page.ended_safely() and job.holds and silent_ns > _SILENT_NS:
-        words = [sys.executable, "-P", "-m", GUARDIAN, path, "act"]
-        os.execv(words[0], words)  # noqa: S606  with the locks, and without a gap
+    if not (job.holds and page.get(PageField.GO)) or page.ended_safely():
+        return
+    heartbeat_ns = page.get(PageField.GUARDIAN_HEARTBEAT_NS)
+    until_s = time.monotonic() + _SILENCE_S
+    while time.monotonic() < until_s:
+        time.sleep(_POLL_S)
+        if page.get(PageField.GUARDIAN_HEARTBEAT_NS) != heartbeat_ns:
+            return  # it acts as soon as this process has ended
+    words = [sys.executable, "-P", "-m", GUARDIAN, path, "act"]
+    os.execv(words[0], words)  # noqa: S606  with the locks, and without a gap
 
 
 def _failed(page: SharedPage, text: str, phase: Phase = Phase.FAILED) -> int:

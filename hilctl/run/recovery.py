@@ -86,7 +86,9 @@ def _recover(run: RunFolder) -> RecoveredRun:
         recovered = recover_recording(path, batches, end, events=events, ended_at=outcome.ended_at)
         text = f"{outcome.reason}; output {where}; {recovered.samples} samples: {recovered.reason}"
     except (HilctlError, OSError) as error:
-        text = f"{outcome.reason}; output {where}; its recording could not be recovered: {error}"
+        left = sum(batch.flags.size for batch in batches)
+        text = f"{outcome.reason}; output {where}; {left} samples are only in memory, because its "
+        text += f"recording could not be recovered: {error}"
         return RecoveredRun(run.card.name, path, outcome.safe, text, run.path)
     return RecoveredRun(run.card.name, path, outcome.safe, text)
 

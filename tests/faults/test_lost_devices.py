@@ -1,6 +1,7 @@
 """A device that is gone when its loop ends: its guardian goes on, and others can relieve it."""
 
 import json
+import os
 import signal
 import time
 from pathlib import Path
@@ -30,9 +31,9 @@ class Module:
     On TCP, because a new pseudo-terminal is another device: only an address stays.
     """
 
-    def __init__(self, emulate, profile):
+    def __init__(self, emulate, profile, pulled_at=PULLED_AT):
         self._emulate, self._profile = emulate, profile
-        words = ("--link", "rtu_tcp", "--fault", f"unplug@{PULLED_AT}")
+        words = ("--link", "rtu_tcp", "--fault", f"unplug@{pulled_at}")
         self.emulated = emulate(profile, *words)
         self.place = tcp(self.emulated.address)
 
@@ -108,6 +109,26 @@ def test_the_user_can_end_the_guardian(abandoned):
     (run,) = active()
     assert said("stop", "--run", run["name"])["ended"]
     assert all(run["state"] != "setting the safe value" for run in active())
+
+
+def test_the_recording_is_complete_while_the_guardian_still_tries(emulate, run, profile):
+    module = Module(emulate, profile("rtu_module"), pulled_at=10**9)
+    section = {**MODULE, "profile": profile("rtu_module"), **module.place, "framing": "rtu"}
+    started = run({**section, "timeout_s": 0.5}, sample_rate_hz=100)
+    module.emulated.log.await_events("OUT", PULLED_AT, started.process)
+    module.emulated.end()
+    loop = started.loop_pid()
+    os.kill(started.process.pid, signal.SIGKILL)  # first, because it would record the end
+    os.kill(loop, signal.SIGKILL)
+    started.process.communicate()
+    (guarded,) = active()
+    assert guarded["state"] == "setting the safe value"
+    recording = started.assert_recorded(at_least=50)
+    assert recording.end["output_state"] == "unknown"
+    module.come_back()
+    module.await_output(0.0, within_s=5.0)
+    assert said("stop", "--run", guarded["name"])["ended"]
+    assert active() == []
 
 
 @pytest.fixture

@@ -30,7 +30,13 @@ from types import FrameType
 
 from hilctl.base.device import Device
 from hilctl.base.errors import HilctlError, InputError
-from hilctl.loop.safe_output import PATIENT_AFTER_S, LocalError, SafeGoal, SafeOutput
+from hilctl.loop.safe_output import (
+    PATIENT_AFTER_S,
+    PATIENT_PAUSE_S,
+    LocalError,
+    SafeGoal,
+    SafeOutput,
+)
 from hilctl.machine.rt_setup import be_ordinary, be_quick
 from hilctl.machine.syscalls import LinuxProcess
 from hilctl.run.job import Job, SilenceLimits
@@ -150,6 +156,8 @@ class SafeAction:
                 self._result = SafeActionResult(
                     self._hung, output.state, output.error, output.final
                 )
+                if output.pause_s >= PATIENT_PAUSE_S:
+                    be_ordinary()
                 if not output.final:
                     self._ending.wait(output.pause_s)
         except LocalError as error:
