@@ -3,8 +3,8 @@
 Each number has one writer, and no process waits for another. A number that announces other data is
 published and observed, in order with the data; see :mod:`hilctl.kernels.atomics`.
 
-The guardian imports this module, so it must not import numba. The guardian only reads single
-numbers, and readers accept its text only as complete JSON.
+The guardian imports this module, so it must not import numba. The guardian only reads and writes
+single numbers, and readers accept its text only as complete JSON.
 """
 
 import json
@@ -97,7 +97,6 @@ class PageField(IntEnum):
     REAL_TIME = 74
     RECORDED = 75
     GUARDIAN_PID = 76
-    SAFE_WRITES = 77
     LAST_SAFE_WRITE = 78
     AWAITS_DEVICE = 79
     HAS_DEVICE = 80
@@ -287,15 +286,14 @@ class SharedPage:
 
     def note_safe_write(self, value: float) -> None:
         """Note a write of the safe ramp, so that another process can continue it."""
-        self.put_float(PageField.LAST_SAFE_WRITE, value)
-        # After the value, which the count announces.
-        self.put(PageField.SAFE_WRITES, self.get(PageField.SAFE_WRITES) + 1)
+        # One number, because the guardian cannot publish; a written 0 is -0.0, none is 0.0.
+        self.put_float(PageField.LAST_SAFE_WRITE, value or -0.0)
 
     def last_safe_write(self) -> float | None:
         """Return the last value of the safe ramp; None before the first."""
-        return (
-            self.get_float(PageField.LAST_SAFE_WRITE) if self.get(PageField.SAFE_WRITES) else None
-        )
+        if self.get(PageField.LAST_SAFE_WRITE) == 0:
+            return None
+        return self.get_float(PageField.LAST_SAFE_WRITE) + 0.0
 
     def ended_safely(self) -> bool:
         """Return whether the loop ended with a safe output."""

@@ -4,6 +4,7 @@ import json
 from dataclasses import asdict
 from mmap import mmap
 
+import numpy as np
 import pytest
 
 from hilctl.base.events import Event
@@ -23,6 +24,16 @@ def test_numbers_are_shared(sides):
     one.put(PageField.STOP, 3)
     one.put_float(PageField.TUNE_GAIN, -0.125)
     assert (other.get(PageField.STOP), other.get_float(PageField.TUNE_GAIN)) == (3, -0.125)
+
+
+@pytest.mark.parametrize("value", [0.0, -0.0, -2.5])
+def test_a_safe_write_is_a_single_number(sides, value):
+    """Two could be seen in the other order on ARM64: a ramp would go on from a wrong value."""
+    one, other = sides
+    assert other.last_safe_write() is None
+    one.note_safe_write(value)
+    assert np.count_nonzero(other.integers) == 1
+    assert str(other.last_safe_write()) == str(value + 0.0)
 
 
 def test_each_text_has_a_place_of_its_own(sides):
