@@ -175,6 +175,7 @@ _MOST_WAITING = 16
 _WAIT_S = 20.0  # longest wait for the previous change; a client waits longer for its answer
 _POLL_S = 0.005
 _LEAD_S = 0.05  # time from the answer to the first sample of a change
+_ROUNDING = 1e-9  # relative; a run at its slew limit still accepts an offset
 _CYCLE = 2000  # samples per cycle of the sine from which the command range is computed
 
 
@@ -271,7 +272,7 @@ class Changes:
 
 def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, bypassed: bool) -> str:
     """Return why a changed reference would exceed the limits, or an empty text."""
-    # The whole range counts; limiter and interlocks enforce slew and heat.
+    # The whole waveform counts; the interlock enforces the heat.
     low, high = sorted(gain * end + offset for end in checked.reference.span)
     problems = reference_problems(checked.loaded, checked.reference.unit, low, high)
     commands = [*command_range(checked, low, high, gain)]
@@ -281,7 +282,7 @@ def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, byp
         checked.forecast,
         command_min=float(np.min(commands)),  # keeps a NaN, where min() would not
         command_max=float(np.max(commands)),
-        slew_per_s=0.0,
+        slew_per_s=_slew_per_s(checked, min(commands), max(commands)),
         voltage_v=_voltage_v(checked, min(commands), max(commands)),
         budget_used_s=None,
     )
@@ -312,6 +313,19 @@ def _checked_range(checked: CheckedExperiment) -> tuple[float, float]:
         return _sine_commands(checked, *span)
     ends = [line.slope * end + line.at_zero for end in span]
     return min(ends), max(ends)
+
+
+def _slew_per_s(checked: CheckedExperiment, low: float, high: float) -> float:
+    """Return the fastest change of commands from ``low`` to ``high``, which grows with the range.
+
+    It is 0, for unknown, if the fastest one of the checked run is before the waveform or the step
+    to its first command.
+    """
+    forecast, before = checked.forecast, _checked_range(checked)
+    if forecast.fastest_at_s <= forecast.before_s:
+        return 0.0
+    grown = (high - low) / max(before[1] - before[0], 1e-300)
+    return forecast.slew_per_s * (1.0 - _ROUNDING) * grown
 
 
 def _voltage_v(checked: CheckedExperiment, low: float, high: float) -> float | None:

@@ -160,7 +160,7 @@ device: {kind: simulated_terfenol}
 sample_rate_hz: 10000
 waveform: WAVEFORM
 compensator: COMPENSATOR
-limits: {peak_current_a: PEAK, slew_a_per_s: 1.0e+6, stroke_um: [-75.0, 60.0]}
+limits: {peak_current_a: PEAK, slew_a_per_s: SLEW, stroke_um: [-75.0, 60.0]}
 """
 SINE = """{kind: sine, unit: UNIT, amplitude: AMPLITUDE, offset: OFFSET, frequency_hz: HZ,
   duration_s: 2.0, soft_start_s: 0.5}"""
@@ -170,10 +170,18 @@ LOOKING_AHEAD = StagedModel.around(RDPI, lag=FieldLag(tau_s=2e-3))
 
 
 def experiment_of(
-    model=None, amplitude=4.0, offset=0.0, hz=10.0, peak_a=7.0, limits="", amplifier="null"
+    model=None,
+    amplitude=4.0,
+    offset=0.0,
+    hz=10.0,
+    peak_a=7.0,
+    limits="",
+    amplifier="null",
+    slew_a_per_s=1e6,
 ):
     text = TEXT.replace("WAVEFORM", SINE).replace("UNIT", "A" if model is None else "um")
-    for name, value in {"AMPLITUDE": amplitude, "OFFSET": offset, "HZ": hz, "PEAK": peak_a}.items():
+    numbers = {"AMPLITUDE": amplitude, "OFFSET": offset, "HZ": hz, "PEAK": peak_a}
+    for name, value in {**numbers, "SLEW": slew_a_per_s}.items():
         text = text.replace(name, str(value))
     text = text.replace("COMPENSATOR", "none" if model is None else f"{{model: {MODEL}}}")
     text = text.replace("stroke_um", limits + "stroke_um")
@@ -350,6 +358,32 @@ def test_an_inverse_that_is_not_there_can_not_go_out(page):
 def test_without_a_model_the_bound_is_exact(gain, offset, refused):
     made = experiment_of(peak_a=5.0)
     assert bool(bound_refusal(made, gain, offset, bypassed=False)) == refused
+
+
+@pytest.mark.parametrize(("gain", "offset", "refused"), [
+    (1.0, 1.0, False),
+    (1.19, 0.0, False),
+    (1.2, 0.0, True),
+    (-1.2, 0.0, True),
+])  # fmt: skip
+def test_a_change_beyond_the_slew_limit_is_refused(gain, offset, refused):
+    """4 A of 10 Hz change by 251 A/s."""
+    why = bound_refusal(experiment_of(slew_a_per_s=300.0), gain, offset, bypassed=False)
+    assert ("301.5" in why) == ("300 A/s" in why) == refused
+
+
+@pytest.mark.parametrize("model", [None, RDPI])
+def test_a_run_at_its_slew_limit_accepts_an_offset(model):
+    slew_per_s = experiment_of(model).forecast.slew_per_s
+    made = experiment_of(model, slew_a_per_s=slew_per_s)
+    assert bound_refusal(made, 1.0, 0.01, bypassed=False) == ""
+    assert "A/s" in bound_refusal(made, 1.01, 0.0, bypassed=False)
+
+
+def test_the_step_to_the_first_command_does_not_limit_a_change():
+    made = experiment_of(slew_a_per_s=300.0)
+    stepped = replace(made, forecast=replace(made.forecast, fastest_at_s=made.forecast.before_s))
+    assert bound_refusal(stepped, 1.2, 0.0, bypassed=False) == ""
 
 
 @pytest.mark.parametrize(("gain", "offset", "refused"), [
