@@ -22,6 +22,18 @@ _YEAR_DAYS = 366
 _TIMEOUT_TICKS = 3  # that devices ask for when they are opened
 
 
+def timeout_warnings(config: Experiment) -> tuple[str, ...]:
+    """Return a warning if the device's timeout exceeds the time that a run waits for an answer."""
+    timeout_s, limit_s = config.device.get("timeout_s"), config.timing.max_late_s
+    if not isinstance(timeout_s, int | float) or timeout_s <= limit_s:
+        return ()
+    return (
+        f"device.timeout_s: {timeout_s:g} s is longer than timing.max_late_s, {limit_s:g} s, but "
+        "an exchange that takes longer than max_late_s ends the run. Lower timeout_s, or raise "
+        "max_late_s.",
+    )
+
+
 def pace_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
     """Return a warning if many ticks will be late; none for a device with its own clock."""
     if info.latency_blocks or config.tick_s >= SHORTEST_TICK_S:

@@ -31,6 +31,7 @@ from hilctl.experiment.device_rules import (
     device_problems,
     pace_warnings,
     start_warnings,
+    timeout_warnings,
 )
 from hilctl.experiment.device_state import (
     CompensatorStart,
@@ -155,7 +156,7 @@ def check(
             raise ConfigError([at_worst(each) for each in found])
     info = loaded.device.info
     warnings += (*pace_warnings(config, info), *calibration_warnings(info, now_s))
-    warnings += start_warnings(config, info)
+    warnings += (*timeout_warnings(config), *start_warnings(config, info))
     warnings += tuple(_clamped(loaded, forecast))
     return CheckedExperiment(
         loaded, reference, forecast, begun, warnings, heat_a2, operator, findings.expected

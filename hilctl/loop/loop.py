@@ -94,6 +94,7 @@ class Loop:
         self._on_ramp = False
         self._missing = 0
         self._dropped = 0
+        self._exchange_ns = 0  # of the previous tick
         self._code: Code = "completed"
         self._reason = "waveform completed"
         self._faults: set[str] = set()
@@ -274,6 +275,8 @@ class Loop:
         if self._phase is _LEAVING:
             return
         if late := self._pacer.too_late():
+            if self._exchange_ns > self._pacer.late_ns:
+                late += f"; the exchange before it took {self._exchange_ns * 1e-9:.3f} s"
             self._begin_safe_ramp("fault", "late", late)
         elif stop:
             self._begin_safe_ramp("stopped", "stopped", stop)
@@ -379,7 +382,7 @@ class Loop:
             active = self._phase is _FOLLOWING
             if self._pulses.follow(head[_FIRST_SAMPLE], active=active):
                 sent.flags |= _TRIGGER
-        head[_EXCHANGE_NS] = self._clock.now_ns() - before_ns
+        head[_EXCHANGE_NS] = self._exchange_ns = self._clock.now_ns() - before_ns
         if self._attributes:
             for name in self._attributes:
                 getattr(answered, name)[:] = getattr(self._device, name)

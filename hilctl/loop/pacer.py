@@ -174,7 +174,8 @@ class Pacer:
         if self.tick < rules.grace_ticks:
             return ""
         if self.late_ns > rules.max_late_ns:
-            return f"tick {self.tick} woke {self.late_ns * 1e-9:.3f} s late, more than the limit"
+            limit = f"timing.max_late_s ({rules.max_late_ns * 1e-9:g} s)"
+            return f"tick {self.tick} woke {self.late_ns * 1e-9:.3f} s late, more than {limit}"
         if 0 < rules.max_consecutive_late <= self.late_run:
             return f"{self.late_run} ticks in a row woke late, up to tick {self.tick}"
         return self._not_kept

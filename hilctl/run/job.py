@@ -152,7 +152,8 @@ def silence_limits(checked: "CheckedExperiment") -> SilenceLimits:
     return SilenceLimits(
         real_time_s=periods_s + hang_s,
         ordinary_s=periods_s + ordinary_s,
-        # A device that takes longer makes the next tick too late, which ends the run as well.
+        # An exchange that takes longer makes the next tick too late, which ends the run as well.
+        # Not the device's timeout, which may be long: until the answer the output stays driven.
         exchange_s=timing.max_late_s,
         # A stopped simulated loop may be under a debugger; no device needs protection.
         stopped_s=periods_s + (hang_s if simulated else min(hang_s, _STOPPED_S)),

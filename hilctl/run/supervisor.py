@@ -141,6 +141,8 @@ class RunMonitor:
         """Outcome of the run; None until the output is safe or nothing more can be done."""
         self.broke = ""
         """Error of the supervisor itself; may be empty."""
+        self._simulated = checked.loaded.device.info.simulated
+        self._ended, self._silent_ns = False, 0  # from the last heartbeat of the loop to its end
 
     def poll(self, stop_signal: int) -> bool:
         """Write the heartbeat, pass stops on, update safety; return whether the run is active."""
@@ -149,6 +151,9 @@ class RunMonitor:
         now_ns = time.monotonic_ns()
         self._page.put(PageField.SUPERVISOR_HEARTBEAT_NS, now_ns)
         self._pass_stop_on(stop_signal)
+        if not self._ended:
+            heartbeat_ns = self._page.get(PageField.LOOP_HEARTBEAT_NS)
+            self._ended, self._silent_ns = ended, now_ns - heartbeat_ns
         if self.outcome is None:
             self._safety.update(now_ns, ended=ended)
             # The safe value before the samples, which are safe in memory.
@@ -190,8 +195,7 @@ class RunMonitor:
             # Without a safe end, guardian or supervisor must act.
             self.outcome = said if self._page.ended_safely() else None
         else:
-            hung = "the loop process hung, and was killed"
-            reason = hung if result.hung else said.reason if said else self._child.death()
+            reason = self._hang() if result.hung else said.reason if said else self._child.death()
             if self._safety.by == "guardian" and result.confirmed:
                 reason += "; the guardian set the output to its safe value"
             output = describe(result.output, result.error)
@@ -201,6 +205,18 @@ class RunMonitor:
             self.outcome = replace(last, code="fault", reason=reason, output=result.output)
         if self.outcome is not None:
             self._recording.end(self.outcome, lost_loop=result is not None and said is None)
+
+    def _hang(self) -> str:
+        """Return how the loop hung: a device may be slow, and the loop waits for it."""
+        config, limit_s = self._config, self._config.timing.max_late_s
+        waited = self._page.get(PageField.EXCHANGING) and not self._simulated
+        if not waited or self._silent_ns <= 1e9 * (limit_s + 2.0 * config.tick_s):
+            return "the loop process hung, and was killed"
+        timeout = f"device.timeout_s is {config.device.get('timeout_s', 'not set')}"
+        return (
+            f"an exchange took longer than timing.max_late_s ({limit_s:g} s; {timeout}), and the "
+            "loop process was killed in it: lower timeout_s, or raise max_late_s"
+        )
 
     def _pass_stop_on(self, stop_signal: int) -> None:
         page = self._page

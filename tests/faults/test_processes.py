@@ -103,7 +103,7 @@ def test_stop_beyond_the_limit_ends_the_run(tmp_path):
     os.kill(run.loop, signal.SIGCONT)
     returned, printed = run.ended()
     assert returned == 3
-    assert "late, more than the limit" in printed["reason"] or "hung" in printed["reason"]
+    assert "late, more than timing.max_late_s" in printed["reason"] or "hung" in printed["reason"]
     assert printed["output_safe"]
 
 

@@ -71,6 +71,16 @@ def test_tcp_fault_ends_the_run_safely(emulate, run, fault):
     started.assert_put_out(writes)
 
 
+@pytest.mark.parametrize("delay_s", [0.3, 1.5])
+def test_slow_answer_names_the_limit_that_ends_the_run(emulate, run, delay_s):
+    """It is within the timeout of the device: the loop ends the run, or is killed."""
+    device = emulate("labjack_t7", "--fault", f"delay:{delay_s}@{FAULT_AT}")
+    started = run(over_tcp(device.address), timing={"max_late_s": 0.1})
+    printed = started.end()
+    assert "timing.max_late_s (0.1 s" in printed["reason"]
+    started.assert_put_out(device.log.await_output("DAC0", 0.0))
+
+
 def test_pulled_cable_leaves_it_to_the_watchdog(emulate, run):
     """The run reports a lost connection, and the device's watchdog sets the safe value."""
     device = emulate("labjack_t7", "--fault", f"unplug@{FAULT_AT}")

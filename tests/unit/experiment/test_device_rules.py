@@ -4,6 +4,7 @@ import math
 from dataclasses import replace
 from datetime import datetime
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -16,6 +17,7 @@ from hilctl.experiment.device_rules import (
     interlock_context,
     pace_warnings,
     start_warnings,
+    timeout_warnings,
 )
 from hilctl.experiment.load import load_experiment, resolve
 from hilctl.experiment.preflight import check
@@ -221,6 +223,14 @@ def warned(*settings, **info):
 def test_ticks_of_less_than_a_tenth_of_a_millisecond_are_told(block, told):
     """The demo has 50 kHz."""
     assert bool(warned(f"block={block}")) == told
+
+
+@pytest.mark.parametrize(("timeout_s", "warnings"), [(0.5, 0), (0.51, 1), ("text", 0), (None, 0)])
+def test_a_timeout_longer_than_a_tick_may_be_late_is_told(timeout_s, warnings):
+    timing = SimpleNamespace(max_late_s=0.5)
+    found = timeout_warnings(SimpleNamespace(device={"timeout_s": timeout_s}, timing=timing))
+    assert len(found) == warnings
+    assert all("timing.max_late_s, 0.5 s" in each for each in found)
 
 
 @pytest.mark.parametrize(("reads", "at_start", "warnings"), [

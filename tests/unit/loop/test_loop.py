@@ -313,7 +313,21 @@ def test_very_late_tick_ends_the_run():
     outcome = rig.run()
     assert outcome.code == "fault"
     assert "woke 2.000 s late" in outcome.reason
+    assert "exchange" not in outcome.reason
     assert rig.device.commands[-1] == 0.0
+
+
+def test_late_tick_after_a_slow_exchange_names_the_exchange():
+    clock, device = FakeClock(), FakeDevice()
+    answered = device.exchange
+
+    def exchange(first_sample, *arrays):
+        answered(first_sample, *arrays)
+        clock.now += 2_000_000_000 * (first_sample == 30)
+
+    device.exchange = exchange
+    outcome = Rig(np.full(10_000, 2.0), clock=clock, device=device).run()
+    assert (outcome.code, "exchange before it took 2.000 s" in outcome.reason) == ("fault", True)
 
 
 def test_skipped_ticks_are_a_counted_gap():

@@ -230,7 +230,7 @@ class TestTooLate:
     @pytest.mark.parametrize(("beyond_ns", "ends"), [(0, False), (1, True)])
     def test_one_tick_beyond_the_limit_ends_it(self, beyond_ns, ends):
         paced = self.paced({2: 1_250_000_000 + beyond_ns}, 3, max_late_ns=1_250_000_000)
-        said = "tick 2 woke 1.250 s late, more than the limit"
+        said = "tick 2 woke 1.250 s late, more than timing.max_late_s (1.25 s)"
         assert paced.too_late() == (said if ends else "")
 
     @pytest.mark.parametrize(("ticks", "ends"), [(5, False), (6, True)])

@@ -491,7 +491,7 @@ def test_memory_that_is_not_to_be_had_is_told(stage, monkeypatch):
 class Run:
     """A started run whose neighbours the test has in its hand."""
 
-    def __init__(self, folder):
+    def __init__(self, folder, *, simulated=False):
         ring = SampleRing.create(folder / "ring", slots=4, block=1, state_size=1)
         self.page, self.ended, self.looks = ring.page, [], []
         recorder = SimpleNamespace(samples=5, error="")
@@ -509,11 +509,16 @@ class Run:
             result=None, by="", update=lambda now_ns, *, ended: self.looks.append(ended)
         )
         self.config = SimpleNamespace(
-            recording=SimpleNamespace(on_failure="stop", ring_s=10.0), compensator=None
+            recording=SimpleNamespace(on_failure="stop", ring_s=10.0),
+            compensator=None,
+            timing=SimpleNamespace(max_late_s=0.2),
+            tick_s=0.01,
+            device={"timeout_s": 0.5},
         )
-        checked = SimpleNamespace(
-            loaded=SimpleNamespace(config=self.config), forecast=SimpleNamespace(samples=100)
+        loaded = SimpleNamespace(
+            config=self.config, device=SimpleNamespace(info=SimpleNamespace(simulated=simulated))
         )
+        checked = SimpleNamespace(loaded=loaded, forecast=SimpleNamespace(samples=100))
         self.started = RunMonitor(checked, ring, self.child, self.safety, self.recording)
 
 
@@ -594,6 +599,31 @@ def test_who_acted_is_said_and_only_what_was_confirmed(run, result, by, words):
     assert (outcome.code, outcome.output) == ("fault", result.output)
     assert all(word in outcome.reason for word in words)
     assert lost_loop
+
+
+@pytest.mark.parametrize(("exchanging", "silent_ms", "simulated", "slow"), [
+    (1, 221, False, True),
+    (1, 219, False, False),  # as a loop that was stopped in an exchange
+    (0, 221, False, False),
+    (1, 221, True, False),
+])  # fmt: skip
+def test_a_loop_killed_in_a_slow_exchange_names_the_limit(
+    tmp_path, monkeypatch, exchanging, silent_ms, simulated, slow
+):
+    """The silence is that before the kill: the ramp to the safe value may take long."""
+    run, now = Run(tmp_path, simulated=simulated), Time()
+    monkeypatch.setattr(module, "time", now)
+    run.page.put(PageField.LOOP_HEARTBEAT_NS, now.now_ns)
+    run.page.put(PageField.EXCHANGING, exchanging)
+    now.sleep(silent_ms * 1e-3)
+    run.child.ended = True
+    run.started.poll(0)
+    now.sleep(1.0)
+    run.safety.result = SafeActionResult(True, "confirmed")
+    run.started.poll(0)
+    ((outcome, _),) = run.ended
+    expected = ["timing.max_late_s (0.2 s", "timeout_s is 0.5"] if slow else ["process hung"]
+    assert all(word in outcome.reason for word in expected)
 
 
 def test_a_loop_that_lost_its_device_keeps_its_account_of_the_end(run):
