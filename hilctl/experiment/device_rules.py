@@ -1,6 +1,7 @@
 """Rules between an experiment and its device: range, rate, blocks, watchdog, interlocks."""
 
 import math
+import re
 from collections.abc import Iterator
 from datetime import UTC, datetime
 
@@ -20,6 +21,12 @@ SHORTEST_TICK_S = 1e-4
 _TRAVEL = 0.02  # of the command's range: far above noise, far below any useful run
 _YEAR_DAYS = 366
 _TIMEOUT_TICKS = 3  # that devices ask for when they are opened
+_AUX_NAME = re.compile("[A-Za-z][A-Za-z0-9_]{0,62}")  # as MATLAB has it
+TAKEN_AUX_NAMES = {
+    "run", "end", "segments", "experiment_yaml", "model_yaml", "run_id", "name", "date",  # exports
+    "reference", "displacement", "error", "command", "measured", "wanted", "slew",  # the live page
+}  # fmt: skip
+"""Names that a channel must not have, besides the columns of a recording."""
 
 
 def timeout_warnings(config: Experiment) -> tuple[str, ...]:
@@ -74,6 +81,7 @@ def device_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
     yield from _range_problems(loaded)
     yield from _pace_problems(loaded)
     yield from _watchdog_problems(loaded)
+    yield from _aux_problems(loaded)
     yield from _interlock_problems(loaded)
     yield from _trigger_problems(loaded)
 
@@ -159,6 +167,18 @@ def _watchdog_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
         if info.arm_s:
             rule += f" and {info.arm_s:.2g} s to arm it on this line"
         yield loaded.problem("device.watchdog.timeout_s", rule, f"{timeout_s:g}")
+
+
+def _aux_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
+    """Yield the auxiliary channels whose names no export or live page could keep apart."""
+    seen = set(TAKEN_AUX_NAMES)
+    for channel in loaded.device.info.aux:
+        if not _AUX_NAME.fullmatch(channel.name) or channel.name in seen:
+            rule = "the name must be a letter and up to 62 letters, digits and '_', and not a name "
+            rule += "that exports or the live page use already"
+            hint = "end it with the unit, such as coil_c"
+            yield loaded.problem(f"device.aux.{channel.name}", rule, hint=hint)
+        seen.add(channel.name)
 
 
 def interlock_context(config: Experiment, info: DeviceInfo) -> InterlockContext:

@@ -20,6 +20,7 @@ from hilctl.analysis.export_files import NpzFile
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Samples
 from hilctl.base.segments import Segment
+from hilctl.experiment.device_rules import TAKEN_AUX_NAMES
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording, Ticks
 
@@ -163,6 +164,7 @@ def test_the_facts_of_the_run_are_kept(tmp_path: Path, suffix: str, texts_of) ->
     assert json.loads(facts["end"]) == {"reason": "done"}
     assert json.loads(facts["segments"])[0]["period"] == 1000.0 / 3.0
     assert (facts["experiment_yaml"], facts["model_yaml"]) == (YAML, "")
+    assert facts.keys() <= TAKEN_AUX_NAMES, "a channel of this name would be lost"
 
 
 @pytest.mark.parametrize("name", ["out.xlsx", "out", "out.csv.gz"])

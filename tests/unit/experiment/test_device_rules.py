@@ -9,6 +9,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
+from hilctl.base.device import AuxChannel
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
 from hilctl.experiment import device_rules
@@ -115,6 +116,18 @@ class TestConsistency:
         keys = [f"limits.{setting.partition('=')[0]}" for setting in settings]
         assert [problem.key for problem in found] == keys
         assert all(word in problem.rule for problem in found)
+
+    @pytest.mark.parametrize(("names", "refused"), [
+        (["coil_c", "c" * 63], []),
+        (["c" * 64], ["c" * 64]),
+        (["température", "_x", "coil_c"], ["température", "_x"]),
+        (["coil_c", "coil_c"], ["coil_c"]),
+        (["end", "displacement", "run_id"], ["end", "displacement", "run_id"]),
+    ])  # fmt: skip
+    def test_names_of_auxiliary_channels(self, names, refused):
+        """MATLAB accepts 63 letters, digits and '_'; no two columns or signals have one name."""
+        found = device_rules._aux_problems(loaded(CURRENT, aux=tuple(map(AuxChannel, names))))
+        assert [each.key for each in found] == [f"device.aux.{name}" for name in refused]
 
     def test_device_that_does_not_measure(self):
         (found,) = refusals(CURRENT, "limits.measured_deviation_a=1.0", measures_command=False)

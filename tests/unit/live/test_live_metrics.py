@@ -8,6 +8,7 @@ import pytest
 
 from hilctl.base.samples import BlockBatch, BlockHeader, Flag
 from hilctl.base.segments import Segment
+from hilctl.experiment.device_rules import TAKEN_AUX_NAMES
 from hilctl.live import live_metrics
 from hilctl.live.scope import ROW
 from hilctl.run.metadata import AuxBounds, RunDescription
@@ -174,3 +175,9 @@ def test_coil_heat_agrees_with_the_interlock(description):
 @pytest.mark.parametrize(("part", "level"), [(0.5, "info"), (0.81, "warning"), (0.96, "error")])
 def test_level_of_a_gauge(part, level):
     assert live_metrics.Gauge("slew", part, part, 1.0, "A/s").level == level
+
+
+def test_no_auxiliary_channel_has_the_name_of_a_signal():
+    """Its gauge would be that of the signal."""
+    names = {*ROW, *live_metrics._HELD}
+    assert {name for name in names if name.isidentifier()} <= TAKEN_AUX_NAMES
