@@ -202,7 +202,7 @@ def adapt_block(
         reference_um: float64[n].
         input_um: float64[n], the model's input.
         displacement_um: float64[n].
-        flags: uint32[n]; samples with a flag are ignored.
+        flags: uint32[n]; samples with a flag are ignored, also where they are shown later.
         settings: float64[8], see the names above.
         table: float64[3, m]: bound of each parameter, centre of its regressor before it is
             orthogonalised, and mean square after that; infinite if it is not adapted.
@@ -218,12 +218,11 @@ def adapt_block(
         Number of samples used.
     """
     found, total = state[FOUND], state[TOTAL]
-    size, last, taken, usable = reference_um.size, memory.size - 1, 0, 1.0
+    size, last, taken = reference_um.size, memory.size - 1, 0
     total[:] = 0.0
     for k in range(size):
-        usable = math.nan if flags[k] else usable
-    for k in range(size):
-        # What is not usable is not shown later either.
+        # NaN also in the delay lines: what shows a flagged sample later is ignored as well.
+        usable = math.nan if flags[k] else 1.0
         error = displacement_um[k] * usable - _delayed(reference_um[k] * usable, due, places, 0)
         x_um = _delayed(input_um[k] * usable, shown, places, 1) + state[VALUE, OFFSET]
         near = abs(x_um - settings[MIDDLE_UM]) <= _FURTHEST * settings[HALF_UM]

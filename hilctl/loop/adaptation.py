@@ -257,8 +257,8 @@ class Adaptation:
     def take(self, block: Block) -> None:
         """Adapt to an answered block, in any phase of the run.
 
-        Blocks with a flag (interlock, limiter, skipped ticks, ramp, conditioning) change nothing,
-        nor do displacements that show the inputs of such a block.
+        Samples with a flag (interlock, limiter, skipped ticks, ramp, conditioning) change nothing,
+        nor do displacements that show the inputs of such samples.
         """
         if block.skipped:
             self._due[:] = self._shown[:] = np.nan

@@ -159,9 +159,21 @@ def test_flags_hold_for_what_is_shown_later():
     assert step.take(reference, 1.0) == 7
     flags = np.zeros(10, dtype=np.uint32)
     flags[-1] = 2
-    assert step.take(reference, 1.0, flags) == 0
-    assert step.take(reference, 1.0) == 7
+    assert step.take(reference, 1.0, flags) == 9
+    assert step.take(reference, 1.0) == 8
     assert step.take(reference, 1.0) == 10
+
+
+def test_one_flag_does_not_stop_a_long_block():
+    """Near a limit each long block has some limited samples: nothing would be learned."""
+    long, short = Step(), Step()
+    flags = np.zeros(580, dtype=np.uint32)
+    flags[300] = 1
+    error = np.where(flags, 19.0, 2.0)
+    assert long.take(np.full(580, MIDDLE_UM), error, flags) == 579
+    assert short.take(np.full(580, MIDDLE_UM), 2.0 * (flags == 0)) == 580
+    assert long.values.tolist() == short.values.tolist()
+    assert long.values[kernel.OFFSET] > 0.0
 
 
 def test_large_regressors_count_no_more():
