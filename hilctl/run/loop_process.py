@@ -56,6 +56,11 @@ class RingHost:
         self._numbers = ring.page.numbers
         self._supervisor = supervisor
         self._silence_ns = silence_s * 1e9
+        self._silent = (
+            f"stopped because the supervisor was silent for {silence_s:g} s, half of "
+            "recording.ring_s: the computer is too busy to run it, or it was suspended; "
+            "end other programs, or raise recording.ring_s"
+        )
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
         """Write the heartbeat; return the reason to stop, or an empty text."""
@@ -69,7 +74,7 @@ class RingHost:
         if not self.supervised():
             return "stopped because the supervisor died"
         if now_ns - numbers[_SUPERVISOR_HEARTBEAT_NS] > self._silence_ns:
-            return f"stopped because the supervisor was silent for {self._silence_ns * 1e-9:g} s"
+            return self._silent
         return ""
 
     def starts_at(self, time_ns: int) -> None:

@@ -118,7 +118,7 @@ def test_supervisor_that_falls_silent_ends_the_run(tmp_path):
     os.kill(run.process.pid, signal.SIGCONT)
     returned, printed = run.ended()
     assert returned == 3
-    assert printed["reason"] == "stopped because the supervisor was silent for 2.5 s"
+    assert "supervisor was silent for 2.5 s" in printed["reason"]
     recording = read(run.output)
     assert contiguous(recording)
     assert recording.dropped == 0
