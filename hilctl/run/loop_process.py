@@ -232,6 +232,7 @@ def _become_guardian(path: str, job: Job, page: SharedPage) -> None:
         time.sleep(_POLL_S)
         if page.get(PageField.GUARDIAN_HEARTBEAT_NS) != heartbeat_ns:
             return  # it acts as soon as this process has ended
+    os.dup2(1, 2)  # otherwise a reader of the supervisor's errors waits for this process
     words = [sys.executable, "-P", "-m", GUARDIAN, path, "act"]
     os.execv(words[0], words)  # noqa: S606  with the locks, and without a gap
 

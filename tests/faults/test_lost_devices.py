@@ -131,6 +131,30 @@ def test_the_recording_is_complete_while_the_guardian_still_tries(emulate, run, 
     assert active() == []
 
 
+def test_a_loop_that_is_the_last_process_becomes_the_guardian(emulate, run, profile):
+    """Supervisor and guardian are killed, and the device is away when the loop ramps down."""
+    module = Module(emulate, profile("rtu_module"), pulled_at=10**9)
+    section = {**MODULE, "profile": profile("rtu_module"), **module.place, "framing": "rtu"}
+    started = run({**section, "timeout_s": 0.5}, sample_rate_hz=100)
+    module.emulated.log.await_events("OUT", PULLED_AT, started.process)
+    loop = started.loop_pid()
+    path = Path(f"/proc/{started.process.pid}/task/{started.process.pid}/children")
+    children = set(map(int, path.read_text().split()))
+    os.kill(started.process.pid, signal.SIGKILL)
+    for guardian in children - {loop}:
+        os.kill(guardian, signal.SIGKILL)
+    module.emulated.end()
+    started.process.communicate()
+    deadline = time.monotonic() + 60.0
+    while [each["state"] for each in active()] != ["setting the safe value"]:
+        assert time.monotonic() < deadline
+    module.come_back()
+    module.await_output(0.0, within_s=5.0)
+    (guarded,) = active()
+    assert said("stop", "--run", guarded["name"])["ended"]
+    assert active() == []
+
+
 @pytest.fixture
 def on_a_port(tmp_path, emulate, run, profile):
     """Return a function that starts a run on a module's port, or on a link to it."""
