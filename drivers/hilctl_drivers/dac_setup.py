@@ -201,6 +201,8 @@ class DacSetup:
                 "watchdog_timeout_s": options.watchdog.timeout_s,
                 "watchdog_reason": options.watchdog.reason,
             }
+        held = writer.holds  # once, because a name server may be slow
+        unit = "" if writer.unit is None else f"unit {writer.unit}, "
         return DeviceInfo(
             name=kind,
             description=description,
@@ -214,7 +216,9 @@ class DacSetup:
             rate_note=rates.note,
             files=files,
             calibration=options.calibration_file,
-            holds=tuple(dict.fromkeys(writer.holds + reader.holds)),
+            holds=tuple(dict.fromkeys(held + (reader.holds if self.reads_elsewhere else ()))),
+            identity=writer.identity(held),
+            output=f"{unit}{getattr(self.output, 'address', options.output)}",
             details=details,
             ages_readings=_reader_class(self.reader).AGES,
             aux=tuple(each.channel for each in self.aux),

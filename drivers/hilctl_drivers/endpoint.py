@@ -6,6 +6,7 @@ from hilctl.base.errors import InputError
 from hilctl_drivers.profile import check_baud, with_link
 from hilctl_drivers.profile_base import BaseProfile, SerialLineSettings, StreamSettings
 from hilctl_drivers.signal_chain import LINE, PORT, STREAM, AddressOptions, DacOptions
+from hilctl_drivers.transport.port_identity import adapter_of
 from hilctl_drivers.transport.resource_names import held_address, held_port
 from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.stream_link import StreamLink
@@ -61,6 +62,11 @@ class Endpoint:
         if self.host:
             return held_address(self.host, int(self.port))
         return held_port(str(self.port))
+
+    def identity(self, holds: tuple[str, ...]) -> tuple[str, ...]:
+        """Return the names for :attr:`hilctl.base.device.DeviceInfo.identity`."""
+        adapter = "" if self.host else adapter_of(str(self.port))
+        return (*filter(None, [adapter]), *holds[::-1])
 
     def link(self) -> TcpLink | StreamLink:
         """Return a new link."""

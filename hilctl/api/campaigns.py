@@ -229,7 +229,7 @@ def campaign(
         if fast:
             plan = planned_fast(steps, chosen)
         else:
-            plan = planned_in_real_time(steps, chosen, host.now_s())
+            plan = planned_in_real_time(steps, chosen, host.now())
         inputs = inputs_of(steps.experiment, steps.settings)
         for suffix in (".csv", ".parquet", ".html"):
             check_no_input(chosen / f"{steps.config.name}{suffix}", inputs)

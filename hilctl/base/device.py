@@ -118,6 +118,10 @@ class DeviceInfo:
         holds: Resources that it uses exclusively while open, with a name common to all devices
             (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``). Empty for a device without such a
             resource.
+        identity: Names of the device with the output, by which its last run is found again: those
+            in ``holds``, the steadiest first, and the serial number of its USB adapter, beginning
+            with ``usb:``, which alone counts between two devices that have one. Empty: ``holds``.
+        output: Name of the output among those of the device; empty if there is one.
         simulated: Whether it drives no hardware and steps on sample count, so that it may run
             faster than real time.
         watchdog_command: Output set by the device's watchdog when the host is silent, in
@@ -158,6 +162,8 @@ class DeviceInfo:
     reads_output: bool = True
     ages_readings: bool = False
     holds: tuple[str, ...] = ()
+    identity: tuple[str, ...] = ()
+    output: str = ""
     simulated: bool = False
     watchdog_command: float | None = None
     watchdog_timeout_s: float | None = None

@@ -3,6 +3,6 @@
 PUBLIC = (
     "closed_loop", "coil_heat", "conditioning", "correction", "device_rules", "device_state",
     "devices", "examples", "file", "forecast", "load", "model_validity", "open_loop", "preflight",
-    "template",
+    "state_files", "template",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

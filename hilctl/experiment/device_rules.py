@@ -3,7 +3,7 @@
 import math
 import re
 from collections.abc import Iterator
-from datetime import UTC, datetime
+from datetime import date
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigProblem, DeviceError
@@ -20,6 +20,7 @@ SHORTEST_TICK_S = 1e-4
 """Shortest tick that timers keep on most machines: an idle CPU takes up to 0.1 ms to wake."""
 _TRAVEL = 0.02  # of the command's range: far above noise, far below any useful run
 _YEAR_DAYS = 366
+_EPOCH = date(1970, 1, 1).toordinal()
 _TIMEOUT_TICKS = 3  # that devices ask for when they are opened
 _AUX_NAME = re.compile("[A-Za-z][A-Za-z0-9_]{0,62}")  # as MATLAB has it
 TAKEN_AUX_NAMES = {
@@ -67,12 +68,12 @@ def calibration_warnings(info: DeviceInfo, now_s: float) -> tuple[str, ...]:
     """Return a warning for each calibration that is too old at a Unix time."""
     if info.calibration is None:
         return ()
-    today = datetime.fromtimestamp(now_s, UTC).date()
+    day = _EPOCH + now_s // 86400.0  # as date.toordinal, beyond its last year as well
     return tuple(
         f"device.calibration: the {part} was calibrated on {made}, more than a year ago. Calibrate "
         f"it again with 'hilctl calibrate {part}'."
         for part, made in info.calibration.content.dates.items()
-        if (today - made).days > _YEAR_DAYS
+        if day - made.toordinal() > _YEAR_DAYS
     )
 
 

@@ -1,36 +1,37 @@
-"""The last run of each device and the state it left: memory of the actuator, heat of the coil.
+"""The state that the last run of an output left: memory of the actuator, heat of the coil.
 
-A compensator starts at rest, or with the memory that earlier commands left.
-
-One small file per device names the run. It is in the user's state folder (``XDG_STATE_HOME``), so
-that copying or recovering an old recording does not change which run was the last. It is written
-when a run begins and again when the run ends. Simulated devices have no file and start at rest.
+A compensator starts at rest, or with the memory that earlier commands left. A file names the run
+(:mod:`hilctl.experiment.state_files`), so that copying or recovering an old recording does not
+change which run was the last. Simulated devices have no file and start at rest.
 """
 
-import hashlib
 import json
-import logging
 import math
-import os
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from datetime import datetime
+from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
-from typing import Annotated
 
 import numpy as np
 
-from hilctl.base.errors import DataError, InputError
-from hilctl.base.files import read_text, write_text
+from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
-from hilctl.base.strict import Field, StrictModel, ValidationError
 from hilctl.base.types import F64
 from hilctl.experiment.coil_heat import CoilHeat, cooled
-from hilctl.experiment.file import Experiment
+from hilctl.experiment.file import Experiment, Limits
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.state_files import (
+    CoilState,
+    LastRun,
+    MachineTime,
+    last_runs,
+    names_of,
+    state_of_run,
+    write_state,
+)
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel, Operator
 from hilctl.recording.metadata_keys import HEAT_FACT
@@ -239,133 +240,101 @@ def _recorded_commands(path: Path, unit: str, sample_rate_hz: float) -> Iterator
         yield np.array([float(piece.run["safe_value"])])
 
 
-_log = logging.getLogger(__name__)
-
-
-class CoilState(StrictModel):
-    """State of the coil after a run."""
-
-    ended: datetime  # end of the run
-    output_safe: bool  # whether the device confirmed its safe value
-    heat_a2: Annotated[float, Field(ge=0.0)]  # running mean square of its current, in A^2
-    thermal_time_constant_s: float | None  # None without a thermal budget
-
-
-class DeviceState(StrictModel):
-    """The last run of a device."""
-
-    holds: list[str]  # resources of the device, see DeviceInfo.holds
-    run_id: str
-    recording: str  # absolute path; its commands determine the actuator's state
-    started: datetime  # due time of its first sample
-    coil: CoilState | None = None  # final state of the coil; None until the run has ended
-
-
-def read_device_state(holds: Sequence[str]) -> DeviceState | None:
-    """Return the state of a device by its resources; None if it has no history."""
-    path = _path(holds)
-    if path is None or not os.path.lexists(path):
-        return None
-    try:
-        return DeviceState.model_validate_json(read_text(path))
-    except (InputError, ValidationError) as error:
-        why = error if isinstance(error, InputError) else f"{path}: is damaged"
-        _log.warning("%s: assuming that the device is at rest and cold", why)
-        return None
-
-
-def write_device_state(state: DeviceState) -> None:
-    """Replace the state of a device; delete the old one if that fails."""
-    path = _path(state.holds)
-    if path is None:
-        return
-    try:
-        path.parent.mkdir(parents=True, exist_ok=True)
-        write_text(path, state.model_dump_json(), overwrite=True)
-    except (InputError, OSError) as error:
-        _log.warning("%s: the next run cannot use the final state of this one", error)
-        with suppress(OSError):
-            path.unlink(missing_ok=True)
-
-
-def _path(holds: Sequence[str]) -> Path | None:
-    """Return the file of a device; None if it has no resources or the user no home folder."""
-    given = os.environ.get("XDG_STATE_HOME", "")
-    try:
-        place = Path(given) if Path(given).is_absolute() else Path.home() / ".local" / "state"
-    except RuntimeError:
-        return None
-    name = hashlib.sha256(json.dumps(list(holds)).encode()).hexdigest()[:32]
-    return place / "hilctl" / "devices" / f"{name}.json" if holds else None
-
-
 _LARGEST_BYTES = 256 << 20  # some minutes at 50 kHz: more would delay the start
+_LITTLE = 1e-3  # of the thermal budget
 
 
-def left_by_last_run(loaded: LoadedExperiment, now_s: float) -> tuple[InitialState | None, str]:
+def left_by_last_run(loaded: LoadedExperiment, now: MachineTime) -> tuple[InitialState | None, str]:
     """Return the actuator's state after the last run (None at rest) and its origin in words.
-
-    ``now_s`` is Unix time here and below.
 
     Raises:
         ModelError: The model has no inverse.
     """
-    config, model, holds = loaded.config, loaded.model, loaded.device.info.holds
-    if not holds or model is None:
+    config, model, info = loaded.config, loaded.model, loaded.device.info
+    if model is None or not names_of(info):
         return None, "at rest"
-    state = read_device_state(holds)
-    if state is None:
+    runs = last_runs(info)
+    if not runs:
         return None, "at rest: no earlier run of this device is known"
-    path = Path(state.recording)
+    last = max(runs, key=lambda run: run.order(now))
     try:
-        _check_run(state)
+        path = _recording_of(last)
+        now_s = last.ended_s + last.since_s(now)
         left = initial_state_after(path, model, config.sample_rate_hz, now_s, config.safe.value)
     except (DataError, OSError) as error:
         return None, f"at rest, because the state after the last run is unknown: {error}"
     return left, f"where {path} left the actuator"
 
 
-def _check_run(state: DeviceState) -> None:
-    """Raise DataError if the recording is too large or not that of the last run."""
-    path = Path(state.recording)
-    if read_ends(path).run.get("run_id") != state.run_id:
+def _recording_of(run: LastRun) -> Path:
+    """Return the recording of a run; raise DataError if it is unknown, too large, or another."""
+    if run.state is None:
+        raise DataError(f"{run.path}: is damaged or of a newer version: remove it if all is cold")
+    path = Path(run.state.recording)
+    if read_ends(path).run.get("run_id") != run.state.run_id:
         raise DataError(f"{path}: is no longer the recording of the last run")
     if path.stat().st_size > _LARGEST_BYTES:
         raise DataError(f"{path}: is larger than {_LARGEST_BYTES >> 20} MB")
+    return path
 
 
-def heat_before(loaded: LoadedExperiment, now_s: float) -> float:
-    """Return the coil's heat left by the last run, in A^2; at least that of the safe value."""
-    config, holds = loaded.config, loaded.device.info.holds
+def heat_before(loaded: LoadedExperiment, now: MachineTime) -> tuple[float, tuple[str, ...]]:
+    """Return the heat in the coil, in A^2, and a note if it is unknown.
+
+    It is the highest that a last run may have left, and at least that of the safe value. An unknown
+    one is the thermal budget, which has decayed since the end of that run.
+    """
+    config, info = loaded.config, loaded.device.info
     rest, tau_s = config.safe.value, config.limits.thermal_time_constant_s
-    state = read_device_state(holds) if tau_s is not None else None
-    if state is None:
-        return rest**2
-    coil = state.coil
-    if coil is None or (coil.output_safe and coil.thermal_time_constant_s != tau_s):
+    found, budget_a2 = [(rest**2, "")], _budget_a2(config)
+    for run in last_runs(info) if tau_s is not None else ():
         try:
-            _check_run(state)
-            return heat_after(Path(state.recording), config, now_s)
-        except (DataError, OSError):
-            heat_a2, ended_s = _budget_a2(config), _last_seen_s(state)
-    else:
-        heat_a2, ended_s = coil.heat_a2, coil.ended.timestamp()
-        if not coil.output_safe:  # the current may have continued
-            heat_a2 = _budget_a2(config)
-    return max(rest**2, cooled(heat_a2, rest, tau_s, now_s - ended_s))
+            heat_a2, why = _heat_left(run, config.limits), ""
+        except (DataError, OSError, ValueError) as error:
+            heat_a2, why = budget_a2, str(error)
+        found.append((cooled(heat_a2, rest, tau_s, run.since_s(now)), why))
+    heat_a2, why = max(found)
+    if not why or heat_a2 - rest**2 < _LITTLE * budget_a2:
+        return heat_a2, ()
+    text = "the coil's heat is unknown, and taken as its full budget at the end of the last run"
+    return heat_a2, (f"{text}: {why}",)
+
+
+def _heat_left(run: LastRun, limits: Limits) -> float:
+    """Return the heat at the end of a run; raise an error if it is unknown."""
+    coil = run.state.coil if run.state else None
+    if coil is None or (
+        coil.output_safe and coil.thermal_time_constant_s != limits.thermal_time_constant_s
+    ):
+        return _heat_at_end(_recording_of(run), limits)[0]
+    if not coil.output_safe:
+        raise DataError(f"{run.path}: the safe value was not confirmed after the last run")
+    return coil.heat_a2
 
 
 def _budget_a2(config: Experiment) -> float:
     return (config.limits.rms_current_a or 0.0) ** 2
 
 
-def _last_seen_s(state: DeviceState) -> float:
-    """Return the latest possible end of a run whose recording cannot be read."""
-    if state.coil is not None:
-        return state.coil.ended.timestamp()
-    path = Path(state.recording)
-    # The folder's time is that of removing or replacing the file.
-    return max(state.started.timestamp(), *(_changed_s(each, 0.0) for each in (path, path.parent)))
+def finish_state(recording: Path, now: MachineTime) -> None:
+    """Write the state that a killed run left, from its recovered recording."""
+    with suppress(DataError, OSError, ValueError):  # it stays unknown
+        run = read_ends(recording).run
+        state = state_of_run(run.get("run_id", ""))
+        if state is None or state.coil is not None:
+            return
+        if state.boot == now.boot:  # it has ended before now
+            state = state.model_copy(update={"boot_s": min(state.boot_s, now.boot_s)})
+            write_state(state)
+        limits = Limits.model_validate_json(run.get("limits", ""), strict=False)
+        heat_a2, ended_s = _heat_at_end(recording, limits)
+        coil = CoilState(
+            ended=datetime.fromtimestamp(ended_s, UTC),
+            output_safe=True,
+            heat_a2=heat_a2,
+            thermal_time_constant_s=limits.thermal_time_constant_s,
+        )
+        write_state(state.model_copy(update={"coil": coil}))
 
 
 def heat_after(path: Path, config: Experiment, now_s: float) -> float:
@@ -373,24 +342,29 @@ def heat_after(path: Path, config: Experiment, now_s: float) -> float:
 
     It is in the recording, or computed from the samples if the supervisor was killed. If those
     cannot be read, or the safe value was not confirmed, the full thermal budget is assumed.
+    ``now_s`` is a Unix time.
     """
     rest = config.safe.value
     try:
-        heat_a2, ended_s = _heat_at_end(path, config)
+        heat_a2, ended_s = _heat_at_end(path, config.limits)
     except (DataError, OSError, ValueError):
         heat_a2, ended_s = _budget_a2(config), _changed_s(path, now_s)
     tau_s = config.limits.thermal_time_constant_s
     return max(rest**2, cooled(heat_a2, rest, tau_s, now_s - ended_s))
 
 
-def _heat_at_end(path: Path, config: Experiment) -> tuple[float, float]:
-    """Return the heat at the end of a run, in A^2, and the Unix time of that end in s."""
+def _heat_at_end(path: Path, limits: Limits) -> tuple[float, float]:
+    """Return the heat at the end of a run, in A^2, and the Unix time of that end in s.
+
+    Raise DataError, OSError or ValueError if it is unknown.
+    """
     ends = read_ends(path)
     run, end = ends.run, ends.end
-    limits = json.loads(run.get("limits", "{}"))
-    same = limits.get("thermal_time_constant_s") == config.limits.thermal_time_constant_s
-    if not end.get("output_safe", "true") == "true":
-        raise DataError(f"{path}: did not confirm its safe value: the coil may still be hot")
+    completed = str(end.get("code") == "completed").lower()
+    if end.get("output_safe", completed) != "true":
+        raise DataError(f"{path}: the run has no known end, or did not confirm its safe value")
+    recorded = json.loads(run.get("limits", "{}"))
+    same = recorded.get("thermal_time_constant_s") == limits.thermal_time_constant_s
     if same and HEAT_FACT in end and "ended" in end:
         return _finite(end), _unix_s(end["ended"])
     if path.stat().st_size > _LARGEST_BYTES:
@@ -399,7 +373,7 @@ def _heat_at_end(path: Path, config: Experiment) -> tuple[float, float]:
 
     recording = read(path)
     rate_hz, samples = recording.sample_rate_hz, recording.samples
-    heat = CoilHeat(config.limits, rate_hz, _finite(run) if HEAT_FACT in run else 0.0)
+    heat = CoilHeat(limits, rate_hz, _finite(run) if HEAT_FACT in run else 0.0)
     heat.follow(samples)
     lasted_s = (int(samples.index[-1]) + 1) / rate_hz if samples.index.size else 0.0
     return heat.heat_a2, _unix_s(run["started"]) + lasted_s

@@ -6,7 +6,6 @@ in advance; the commands are compared with the limits.
 
 import logging
 import math
-import time
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 from decimal import ROUND_CEILING, Context
@@ -47,6 +46,7 @@ from hilctl.experiment.file import Experiment
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_validity import ExpectedError, RangeFindings, range_findings
+from hilctl.experiment.state_files import MachineTime
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.lead_in import Conditioning
 from hilctl.loop.triggers import SHORTEST_CYCLE
@@ -101,12 +101,12 @@ class CheckedExperiment:
 
 
 def check(
-    loaded: LoadedExperiment, heat_a2: float = 0.0, now_s: float | None = None
+    loaded: LoadedExperiment, heat_a2: float = 0.0, now: MachineTime | None = None
 ) -> CheckedExperiment:
     """Compute the complete run and check it against device, model and limits.
 
-    The heat of the coil is at least ``heat_a2``, in A^2, whatever the last run left. ``now_s`` is
-    the Unix time of the start; None for the present.
+    The heat of the coil is at least ``heat_a2``, in A^2, whatever the last run left. ``now`` is
+    the time of the start; None for the present.
 
     Raises:
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
@@ -133,9 +133,10 @@ def check(
     hint = "identify the model on such motions, or keep the waveform within those it was fitted on"
     problems += [loaded.problem("waveform", text, hint=hint) for text in findings.refused]
     try:
-        now_s = time.time() if now_s is None else now_s
-        begun = _start(loaded, reference, conditioned, now_s, problems)
-        heat_a2 = max(heat_a2, heat_before(loaded, now_s))
+        now = MachineTime.now() if now is None else now
+        begun = _start(loaded, reference, conditioned, now, problems)
+        left_a2, unknown = heat_before(loaded, now)
+        heat_a2 = max(heat_a2, left_a2)
         forecast = forecast_of(loaded, reference, begun, conditioned, heat_a2)
     except ModelError as error:
         raise ConfigError([*problems, loaded.problem("compensator.model", str(error))]) from None
@@ -147,20 +148,28 @@ def check(
     problems += _start_problems(loaded, begun, forecast, rest) or command_problems(
         loaded, forecast, reference
     )
-    if problems:
-        raise ConfigError(problems)
+    _refuse(problems, unknown)
     operator = adapted_operator(config, reference)
     for input_um in worst_inputs(config, operator, begun.input_um):
         worst = forecast_of(loaded, reference, begun, conditioned, input_um=input_um)
         if found := command_problems(loaded, worst, reference):
             raise ConfigError([at_worst(each) for each in found])
     info = loaded.device.info
-    warnings += (*pace_warnings(config, info), *calibration_warnings(info, now_s))
+    warnings += (*pace_warnings(config, info), *calibration_warnings(info, now.unix_s))
     warnings += (*timeout_warnings(config), *start_warnings(config, info))
     warnings += tuple(_clamped(loaded, forecast))
+    warnings += unknown
     return CheckedExperiment(
         loaded, reference, forecast, begun, warnings, heat_a2, operator, findings.expected
     )
+
+
+def _refuse(problems: list[ConfigProblem], notes: tuple[str, ...]) -> None:
+    """Raise ConfigError if there are problems, and log notes on their cause."""
+    if problems:
+        for note in notes:
+            _log.warning(note)
+        raise ConfigError(problems)
 
 
 def _mark_problems(loaded: LoadedExperiment, reference: Reference) -> list[ConfigProblem]:
@@ -191,7 +200,7 @@ def _start(
     loaded: LoadedExperiment,
     reference: Reference,
     conditioned: F64,
-    now_s: float,
+    now: MachineTime,
     problems: list[ConfigProblem],
 ) -> CompensatorStart:
     """Return input and initial state of the compensator; add to ``problems`` if one is unknown."""
@@ -203,7 +212,7 @@ def _start(
         except InputError as error:
             hint = "learn again with 'hilctl learn', or remove it"
             problems.append(loaded.problem("compensator.correction", str(error), hint=hint))
-    before, begins = _state_before(loaded, conditioned, now_s, problems)
+    before, begins = _state_before(loaded, conditioned, now, problems)
     if before is not None:
         # With a soft start of this length, it becomes one from where the actuator stands.
         soft = reference.segments[0].steady_start
@@ -216,7 +225,7 @@ def _start(
 
 
 def _state_before(
-    loaded: LoadedExperiment, conditioned: F64, now_s: float, problems: list[ConfigProblem]
+    loaded: LoadedExperiment, conditioned: F64, now: MachineTime, problems: list[ConfigProblem]
 ) -> tuple[InitialState | None, str]:
     """Return the actuator's state before the waveform (None at rest) and its origin in words."""
     config, model = loaded.config, loaded.model
@@ -227,12 +236,12 @@ def _state_before(
     if config.condition is not None:
         begins = "where its condition leaves the actuator"
     elif named == "last":
-        before, begins = left_by_last_run(loaded, now_s)
+        before, begins = left_by_last_run(loaded, now)
     elif named != "rest":
         begins = f"where {named} left the actuator"
         try:
             before = initial_state_after(
-                loaded.folder / named, model, rate_hz, now_s, config.safe.value
+                loaded.folder / named, model, rate_hz, now.unix_s, config.safe.value
             )
         except DataError as error:
             problems.append(loaded.problem("compensator.initial_state", str(error)))

@@ -5,6 +5,7 @@ or refuses writes loses nothing while the ring has room, and delays no other thr
 """
 
 import errno
+import logging
 import threading
 import time
 from collections import deque
@@ -23,8 +24,8 @@ from hilctl.base.files import already_there, reason, sync_folder
 from hilctl.base.samples import BlockBatch, BlockHeader, Samples
 from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.correction import dump_correction
-from hilctl.experiment.device_state import CoilState, DeviceState, write_device_state
 from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.state_files import CoilState, DeviceState, MachineTime, names_of, write_state
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.models.model_file import dump_model
@@ -34,6 +35,8 @@ from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.metadata import EndFigures, end_facts, run_facts, usage_facts
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField
+
+_log = logging.getLogger(__name__)
 
 _SAMPLES_BEFORE = 50
 _SPARE = 20
@@ -52,6 +55,7 @@ class Recorder:
         self.adapted: Mapping[str, float] = {}
         """Values of the last event of adaptation."""
         self._failed = self._problem = ""
+        self._noting: threading.Thread | None = None
         self.next_sample = self._flushed = 0
         self._checked = checked
         self._unix_ns = steady_unix_ns()
@@ -107,20 +111,45 @@ class Recorder:
         self._file.give_back()
 
     def note_device(self, coil: CoilState | None = None) -> None:
-        """Write the device state, with the coil at the end: this run is the device's last one."""
+        """Start to write the device state, with the coil at the end: this is its last run."""
         facts, info = self._run.facts, self._checked.loaded.device.info
-        path = self.path
+        path, now, earlier = self.path, MachineTime.now(), self._noting
         with suppress(OSError):  # the working folder was removed
             path = path.absolute()
-        if info.holds:
-            state = DeviceState(
-                holds=list(info.holds),
-                run_id=facts["run_id"],
-                recording=str(path),
-                started=datetime.fromisoformat(facts["started"]),
-                coil=coil,
-            )
-            write_device_state(state)
+        if not (names := names_of(info)):
+            return
+        state = DeviceState(
+            holds=list(names),
+            output=info.output,
+            run_id=facts["run_id"],
+            recording=str(path),
+            started=datetime.fromisoformat(facts["started"]),
+            boot=now.boot,
+            boot_s=now.boot_s + (self._longest_s() if coil is None else 0.0),
+            coil=coil,
+        )
+
+        def write() -> None:
+            if earlier is not None:
+                earlier.join()
+            write_state(state)
+
+        # Its disk may hang; that of the recording must not wait for it.
+        self._noting = threading.Thread(target=write, name="device state", daemon=True)
+        self._noting.start()
+
+    def await_noted(self, timeout_s: float = _PATIENCE_S) -> None:
+        """Wait until the device state is written, or warn that it cannot be."""
+        if self._noting is not None:
+            self._noting.join(timeout_s)
+            if self._noting.is_alive():
+                _log.warning("the state of the device is not written yet: its disk hangs")
+
+    def _longest_s(self) -> float:
+        """Return the longest time that the run can last."""
+        config, forecast = self._checked.loaded.config, self._checked.forecast
+        awaited_s = config.trigger.timeout_s if config.trigger else 0.0
+        return forecast.before_s + forecast.duration_s + 2.0 * config.safe.ramp_s + awaited_s
 
     def batch(self, batch: BlockBatch) -> None:
         """Write a batch."""
@@ -203,6 +232,7 @@ class Recorder:
                 thermal_time_constant_s=limits.thermal_time_constant_s,
             )
             self.note_device(coil)
+            self.await_noted(patience_s)
         else:
             self._file.stream.abandon()
         return closed

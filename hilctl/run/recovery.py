@@ -10,6 +10,8 @@ from pathlib import Path
 from hilctl.base.errors import HilctlError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, BlockHeader
+from hilctl.experiment.device_state import finish_state
+from hilctl.experiment.state_files import MachineTime
 from hilctl.loop.safe_output import LoopOutcome, describe
 from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
@@ -47,6 +49,7 @@ def recover_dead_runs() -> list[RecoveredRun]:
             if ours:
                 found.append(recovered := _recover(run))
                 if recovered.kept is None:
+                    finish_state(recovered.recording, MachineTime.now())
                     _finish(run, recovered)
     return found
 

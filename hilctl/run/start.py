@@ -28,7 +28,7 @@ from hilctl.experiment.load import LoadedExperiment, input_files, load_experimen
 from hilctl.experiment.preflight import CheckedExperiment, check
 from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends
-from hilctl.run.control.client import HANG_UP, ask, request
+from hilctl.run.control.client import HANG_UP, ask, finish_dead_runs, request
 from hilctl.run.metadata import experiment_sha256, sha256_of
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.run_folder import RunFolder, require_linux, runs
@@ -45,9 +45,12 @@ def checked_experiment(
     """Load an experiment and check it; raise InputError with all problems.
 
     ``settings`` are ``key=value`` texts that override the file; ``heat_a2`` is the minimum heat of
-    the coil, in A^2.
+    the coil, in A^2. A killed run of a device is recovered first, so that its final state counts.
     """
-    return check(load_experiment(path, settings), heat_a2)
+    loaded = load_experiment(path, settings)
+    if loaded.device.info.holds:
+        finish_dead_runs()
+    return check(loaded, heat_a2)
 
 
 def output_of(checked: CheckedExperiment, output: Path | None) -> Path:

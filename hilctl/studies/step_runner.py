@@ -15,6 +15,7 @@ from typing import Any
 
 from hilctl.base.errors import InputError
 from hilctl.base.files import exists
+from hilctl.experiment.state_files import MachineTime
 from hilctl.run.result import RunResult
 from hilctl.run.start import StepStoppedError, paced
 
@@ -27,7 +28,7 @@ class StudyHost:
     """Runs, time and observers of a study."""
 
     run: Callable[..., RunResult] = paced
-    now_s: Callable[[], float] = time.time
+    now: Callable[[], MachineTime] = MachineTime.now
     sleep_s: Callable[[float], None] = time.sleep
     # With the part that is done, 0 to 1, and a description.
     on_progress: Callable[[float, str], None] = field(default=lambda done, text: None)

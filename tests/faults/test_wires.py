@@ -8,7 +8,8 @@ import numpy as np
 import pytest
 import yaml
 
-from hilctl.experiment.device_state import DeviceState
+from hilctl.experiment.state_files import DeviceState, MachineTime
+from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
 from tests.faults.conftest import MODULE, PATIENT_DEVICE, PATIENT_TIMING, T7, each_kind, tcp
@@ -145,7 +146,12 @@ def test_dead_host_is_noticed_by_the_device(emulate, run):
     assert 0.99 * WATCHDOG_S < silent_s < 2.0 * WATCHDOG_S
     assert started.readable_samples() > 100
     # As after a power cut, the run is the device's last and its end is unknown.
-    assert (left().recording, left().coil) == (str(started.output), None)
+    begun = left()
+    assert (begun.recording, begun.coil) == (str(started.output), None)
+    (orphan,) = recover_dead_runs()
+    assert not orphan.safe
+    assert (left().coil, left().boot_s <= MachineTime.now().boot_s) == (None, True)
+    assert begun.boot_s > left().boot_s
 
 
 def test_second_run_on_the_same_device_is_refused(emulate, run):

@@ -58,8 +58,8 @@ class PortIdentity:
 def usb_adapter(device: int, sysfs: Path = Path("/sys")) -> str:
     """Return the identity of the USB adapter that has a device number; empty if there is none.
 
-    Vendor, product, serial number, and which of the adapter's ports it is. An adapter without a
-    number is known by its socket.
+    It begins with ``usb:``, vendor, product and serial number, or with ``socket:`` and its place if
+    it has no number, and ends with the port of several.
     """
     number = f"{os.major(device)}:{os.minor(device)}"
     port = (sysfs / "dev" / "char" / number / "device").resolve()
@@ -71,8 +71,15 @@ def usb_adapter(device: int, sysfs: Path = Path("/sys")) -> str:
     )
     interface = port.relative_to(adapter).parts[0].rpartition(":")[2]
     which = "-".join(filter(None, (interface, _text(port / "port_number"))))
-    place = f"number {serial}" if serial else f"at {adapter.name}"
-    return f"USB {vendor}:{product}, {place}, port {which}"
+    place = f"usb:{vendor}:{product}:{serial}" if serial else f"socket:{adapter.name}"
+    return f"{place}:{which}"
+
+
+def adapter_of(path: str) -> str:
+    """Return the identity of the USB adapter of a port now; empty if there is none."""
+    with suppress(OSError):
+        return usb_adapter(Path(path).stat().st_rdev)
+    return ""
 
 
 def _text(attribute: Path) -> str:

@@ -108,7 +108,9 @@ def held_address(host: str, port: int) -> tuple[str, ...]:
     if address is not None:
         return (_named(address, port),)
     name = host.lower().rstrip(".")
-    found = [_named(each, port) for each in _addresses(name)]
+    found: list[str] = []
+    with suppress(LookupError):
+        found = [_named(each, port) for each in _addresses(name)]
     return tuple(dict.fromkeys((f"tcp:{name}:{port}", *found)))
 
 
@@ -139,6 +141,8 @@ def _addresses(name: str) -> tuple[str, ...]:
     thread = Thread(target=ask, daemon=True)
     thread.start()
     thread.join(_LOOKUP_S)
+    if not found:
+        raise LookupError(name)  # not cached, unlike an answer
     return tuple(found)
 
 

@@ -20,6 +20,7 @@ from hilctl.experiment.coil_heat import CoolingCoil
 from hilctl.experiment.device_state import heat_after, heat_before
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
+from hilctl.experiment.state_files import MachineTime
 from hilctl.identify.parallel import workers
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
@@ -102,7 +103,7 @@ class Campaign:
         self.tables: list[Path] = []
         self._page: Path | None = None
         self._host = host
-        self._next_page_s = host.now_s() + _FIRST_PAGE_S
+        self._next_page_s = host.now().boot_s + _FIRST_PAGE_S
         require_room(plan.folder, plan.megabytes, plan.free_mb)
         for each in plan.steps:
             if each.kept is not None:
@@ -114,7 +115,7 @@ class Campaign:
         self.rows[each.step.number] = row
         if write:
             self.tables = write_table(self.plan, self.rows)
-            if self._host.now_s() >= self._next_page_s:
+            if self._host.now().boot_s >= self._next_page_s:
                 self._write_page()
         self._host.on_step(each.step, row)
 
@@ -125,7 +126,7 @@ class Campaign:
         return CampaignResult(self.plan, self.rows, tables, reason, stop_signal, self._page)
 
     def _write_page(self) -> None:
-        start_s, name = self._host.now_s(), self.plan.campaign.config.name
+        start_s, name = self._host.now().boot_s, self.plan.campaign.config.name
         path = self.plan.folder / f"{name}.html"
         runs = [entry_of(*each) for each in ordered(self.plan, self.rows)]
         try:
@@ -134,7 +135,7 @@ class Campaign:
             self._host.on_note(f"no page: {error}")
             return
         self._page = path
-        now_s = self._host.now_s()
+        now_s = self._host.now().boot_s
         self._next_page_s = now_s + max(_FIRST_PAGE_S, _PAGE_SHARE * (now_s - start_s))
 
 
@@ -156,24 +157,24 @@ def prepared(folder: Path, host: StudyHost) -> Iterator[None]:
         yield
 
 
-def planned_in_real_time(campaign: CampaignSteps, folder: Path, now_s: float) -> CampaignPlan:
+def planned_in_real_time(campaign: CampaignSteps, folder: Path, now: MachineTime) -> CampaignPlan:
     """Return the plan of a campaign in real time; raise ConfigError if a step is not allowed."""
     completed, last = completed_runs(folder), last_started(folder)
     plan = planned(campaign, folder, completed, 0.0)
     if not plan.left:
         return plan
-    heat_a2 = _heat_a2(plan.left[0], last, now_s)
+    heat_a2 = _heat_a2(plan.left[0], last, now)
     return planned(campaign, folder, completed, heat_a2) if heat_a2 > 0.0 else plan
 
 
-def _heat_a2(each: PlannedStep, last: Path | None, now_s: float) -> float:
+def _heat_a2(each: PlannedStep, last: Path | None, now: MachineTime) -> float:
     """Return the heat that the last run of the device or the campaign left in the coil, in A^2."""
     # A simulated device has no history of its own; within a campaign it counts as one rig.
     config, info = each.loaded.config, each.loaded.device.info
-    heat_a2 = heat_before(each.loaded, now_s)
+    heat_a2, _ = heat_before(each.loaded, now)
     if config.limits.thermal_time_constant_s is None or not info.simulated or last is None:
         return heat_a2
-    return max(heat_a2, heat_after(last, config, now_s))
+    return max(heat_a2, heat_after(last, config, now.unix_s))
 
 
 def run_series(plan: CampaignPlan, host: StudyHost) -> CampaignResult:
@@ -247,9 +248,9 @@ class _Steps:
 
     def _cool(self, each: PlannedStep) -> float:
         """Wait until the coil is cool enough; return its heat then, in A^2."""
-        now_s = self._host.now_s()
-        heat_a2 = _heat_a2(each, self._last, now_s)
-        # The coil's own model from here on: a clock that is set back must not keep it hot for ever.
+        now = self._host.now()
+        heat_a2, now_s = _heat_a2(each, self._last, now), now.boot_s
+        # The coil's own model from here on.
         coil = CoolingCoil(each.loaded.config, heat_a2, now_s)
         to_rms_a = self._plan.campaign.config.cool_down.to_rms_a or float("inf")
         pause_s = coil.pause_s(each.heat, now_s, to_rms_a)

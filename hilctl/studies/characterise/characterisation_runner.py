@@ -202,9 +202,8 @@ class CharacterisationRunner:
             self._runner.done_s = sum(planned[name] for name in before)
             planned_s = planned[step.name]
             recording = repeated(partial(self._recorded, step, settings, path, planned_s, heat))
-        now_s = self._host.now_s()
-        # The coil has cooled since a kept run.
-        self._coil.ran(heat, min(path.stat().st_mtime, now_s) if kept else now_s)
+        if not kept:
+            self._coil.ran(heat, self._host.now().boot_s)
         self._recordings[step.name] = path
         seconds = command.size / self.limits.sample_rate_hz
         megabytes = path.stat().st_size / 1e6
@@ -283,9 +282,9 @@ class CharacterisationRunner:
 
     def _pause_s(self, heat: RunHeat) -> float:
         """Return the time to cool after the steps so far and the device's last run."""
-        now_s = self._host.now_s()
-        last = CoolingCoil(self._loaded.config, heat_before(self._loaded, now_s), now_s)
-        return max(coil.pause_s(heat, now_s) for coil in (self._coil, last))
+        now = self._host.now()
+        last = CoolingCoil(self._loaded.config, heat_before(self._loaded, now)[0], now.boot_s)
+        return max(coil.pause_s(heat, now.boot_s) for coil in (self._coil, last))
 
     def _with_model(self, output: Path, *, overwrite: bool) -> Characterisation:
         self._host.on_progress(1.0, "identify")

@@ -2,7 +2,7 @@
 
 import os
 from dataclasses import replace
-from datetime import UTC, datetime
+from datetime import datetime
 from types import SimpleNamespace
 
 import numpy as np
@@ -13,19 +13,23 @@ from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader, Flag
 from hilctl.base.yaml import Document
 from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.device_state import (
-    CoilState,
-    DeviceState,
     InitialState,
+    finish_state,
     heat_after,
     heat_before,
     initial_state_after,
     left_by,
     left_by_last_run,
-    read_device_state,
-    write_device_state,
 )
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
+from hilctl.experiment.state_files import (
+    CoilState,
+    DeviceState,
+    MachineTime,
+    last_runs,
+    write_state,
+)
 from hilctl.models.effective_field import FieldLosses
 from hilctl.models.linear_stages import CreepModel, FirstMode
 from hilctl.models.model_file import dump_model
@@ -219,72 +223,13 @@ def test_recordings_that_don_t_tell_are_refused(tmp_path, model, rate_hz, made, 
         state_after(tmp_path / "absent.mcap", model, rate_hz)
 
 
-AT = datetime(2026, 1, 1, tzinfo=UTC)
 HOLDS = ("tcp:10.0.0.5:502", "serial:/dev/ttyUSB0")
-STATE = DeviceState(
-    holds=[*HOLDS], run_id="one", recording="/runs/one.mcap", started=AT,
-    coil=CoilState(ended=AT, output_safe=True, heat_a2=4.25, thermal_time_constant_s=20.0),
-)  # fmt: skip
 
 
 @pytest.fixture(autouse=True)
 def states(tmp_path, monkeypatch):
     monkeypatch.setenv("XDG_STATE_HOME", str(tmp_path / "state"))
     return tmp_path / "state" / "hilctl" / "devices"
-
-
-def test_what_was_written_is_read(states, caplog):
-    assert read_device_state(HOLDS) is None
-    write_device_state(STATE)
-    assert read_device_state(HOLDS) == STATE
-    assert read_device_state(HOLDS[:1]) is None
-    later = STATE.model_copy(update={"run_id": "two", "coil": None})
-    write_device_state(later)
-    assert read_device_state(HOLDS) == later
-    assert len([*states.iterdir()]) == 1
-    assert caplog.messages == []
-
-
-def test_a_device_that_holds_nothing_has_no_state(states):
-    write_device_state(STATE.model_copy(update={"holds": []}))
-    assert read_device_state(()) is None
-    assert not states.exists()
-
-
-@pytest.mark.parametrize(
-    "content", [b"", b"{", b"[]", b"\xff", b'{"holds": 1}', b"heat NaN", b"heat -1"]
-)
-def test_a_damaged_state_is_none_and_a_warning(states, caplog, content):
-    write_device_state(STATE)
-    (path,) = states.iterdir()
-    if content.startswith(b"heat"):
-        content = path.read_bytes().replace(b"4.25", content.split()[1])
-    path.write_bytes(content)
-    assert read_device_state(HOLDS) is None
-    (said,) = caplog.messages
-    assert str(path) in said
-    assert "\n" not in said
-
-
-def test_where_it_can_not_be_written_no_older_one_is_left(states, caplog, monkeypatch):
-    write_device_state(STATE)
-
-    def full(*_, **__):
-        raise OSError(28, "No space left on device")
-
-    monkeypatch.setattr("hilctl.base.files.os.fsync", full)
-    write_device_state(STATE.model_copy(update={"run_id": "two"}))
-    assert read_device_state(HOLDS) is None
-    assert len(caplog.messages) == 1
-    assert [*states.iterdir()] == []
-
-
-@pytest.mark.parametrize("given", ["", "relative"])
-def test_without_a_folder_of_its_own_it_is_in_the_home(tmp_path, monkeypatch, given):
-    monkeypatch.setenv("XDG_STATE_HOME", given)
-    monkeypatch.setenv("HOME", str(tmp_path / "home"))
-    write_device_state(STATE)
-    assert len([*(tmp_path / "home/.local/state/hilctl/devices").iterdir()]) == 1
 
 
 EXPERIMENT = """\
@@ -297,7 +242,7 @@ limits: {peak_current_a: 6.0, slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}
 recording: {folder: runs}
 """
 
-NOW_S = 2e9
+NOW = MachineTime(2e9, 2e9)
 
 
 STARTED = datetime.fromisoformat("2026-01-01T00:00:00+00:00")
@@ -324,10 +269,12 @@ class Folder:
         self.begin(name, holds=holds, coil=coil)
         return path
 
-    def begin(self, name, *, holds=HOLDS, coil=None):
+    def begin(self, name, *, holds=HOLDS, coil=None, **more):
         path = str(self.runs / f"{name}.mcap")
-        write_device_state(
-            DeviceState(holds=[*holds], run_id=name, recording=path, started=STARTED, coil=coil)
+        write_state(
+            DeviceState(
+                holds=[*holds], run_id=name, recording=path, started=STARTED, coil=coil, **more
+            )
         )
 
 
@@ -343,7 +290,7 @@ def test_the_last_run_of_this_device_is_taken(folder):
     for each in folder.runs.iterdir():
         # As after a recovery, a copy or a checkout of an old recording.
         os.utime(each, (1e9, 1e9) if each == path else (2e9, 2e9))
-    left, words = left_by_last_run(folder.loaded(), NOW_S)
+    left, words = left_by_last_run(folder.loaded(), NOW)
     assert left is not None
     assert left.run_id == "last"
     assert abs(left.stands_um) > 0.5
@@ -358,7 +305,7 @@ def test_the_last_run_of_this_device_is_taken(folder):
 def test_no_older_one_stands_in_for_the_last(folder, made, why):
     folder.record("old")
     folder.record("new", **made)
-    left, words = left_by_last_run(folder.loaded(), NOW_S)
+    left, words = left_by_last_run(folder.loaded(), NOW)
     assert left is None
     assert words.startswith("at rest")
     assert why in words
@@ -368,33 +315,33 @@ def test_no_older_one_stands_in_for_the_last(folder, made, why):
 def test_a_run_without_a_recording_is_not_known(folder):
     folder.record("old")
     folder.begin("new")
-    assert "new.mcap" in left_by_last_run(folder.loaded(), NOW_S)[1]
+    assert "new.mcap" in left_by_last_run(folder.loaded(), NOW)[1]
     (folder.runs / "old.mcap").rename(folder.runs / "new.mcap")
-    left, words = left_by_last_run(folder.loaded(), NOW_S)
+    left, words = left_by_last_run(folder.loaded(), NOW)
     assert left is None
     assert "new.mcap" in words
 
 
 def test_another_rate_or_a_large_file(folder, monkeypatch):
     path = folder.record("new")
-    assert "10000 Hz" in left_by_last_run(folder.loaded("sample_rate_hz=5000"), NOW_S)[1]
+    assert "10000 Hz" in left_by_last_run(folder.loaded("sample_rate_hz=5000"), NOW)[1]
     monkeypatch.setattr("hilctl.experiment.device_state._LARGEST_BYTES", 1 << 10)
-    left, words = left_by_last_run(folder.loaded(), NOW_S)
+    left, words = left_by_last_run(folder.loaded(), NOW)
     assert (left, "0 MB" in words and str(path) in words) == (None, True)
 
 
 def test_nothing_there(folder):
-    words = left_by_last_run(folder.loaded(), NOW_S)[1]
+    words = left_by_last_run(folder.loaded(), NOW)[1]
     assert words.startswith("at rest")
-    folder.record("new", holds=())
-    assert left_by_last_run(folder.loaded(holds=()), NOW_S) == (None, "at rest")
+    folder.record("new")
+    assert left_by_last_run(folder.loaded(holds=()), NOW) == (None, "at rest")
 
 
 class TestCheck:
     def test_by_default(self, folder):
         folder.record("new")
         begun = check(folder.loaded()).begun
-        left, words = left_by_last_run(folder.loaded(), NOW_S)
+        left, words = left_by_last_run(folder.loaded(), NOW)
         np.testing.assert_array_equal(begun.state, left.state)
         assert (begun.run_id, begun.begins) == ("new", words)
         assert begun.input_um[0] == pytest.approx(left.stands_um)
@@ -425,6 +372,11 @@ def coil(heat_a2=4.0, *, output_safe=True, tau_s=20.0):
     )
 
 
+def at(unix_s):
+    """Return a time of a machine that was booted long ago."""
+    return MachineTime(unix_s, 1e9)
+
+
 class TestHeat:
     def record(self, folder, coil=None, end=None, **facts):
         facts |= {
@@ -434,7 +386,9 @@ class TestHeat:
         return folder.record("a", facts=facts, coil=coil, end=end)
 
     def left(self, folder, waited_s, *settings):
-        return heat_before(folder.loaded(*HOT, *settings), ENDED_S + waited_s)
+        heat_a2, notes = heat_before(folder.loaded(*HOT, *settings), at(ENDED_S + waited_s))
+        self.why = " ".join(notes)
+        return heat_a2
 
     def test_it_has_cooled_since(self, folder):
         folder.begin("gone", coil=coil(4.0))
@@ -450,7 +404,7 @@ class TestHeat:
         sure.add(COMMAND)
         expected = 9.0 if HEAT_FACT in end else pytest.approx(sure.heat_a2, rel=1e-9)
         assert heat_after(path, folder.loaded(*HOT).config, ENDED_S - 60.0) == expected
-        assert heat_before(folder.loaded(*HOT), ENDED_S - 60.0) == expected
+        assert self.left(folder, -60.0) == expected
 
     def test_another_time_constant_asks_for_the_samples(self, folder):
         self.record(folder, coil=coil(4.0), end=SAFE_END, **{HEAT_FACT: "0.0"})
@@ -465,20 +419,99 @@ class TestHeat:
         folder.begin("gone", coil=coil(1.0, output_safe=False))
         assert self.left(folder, 0.0) == 9.0
         assert self.left(folder, 20.0) == pytest.approx(9.0 / np.e)
+        assert "not confirmed" in self.why
 
     def test_a_killed_run_without_a_recording_leaves_it_as_hot_as_can_be(self, folder):
         folder.begin("gone")
-        os.utime(folder.runs, (ENDED_S + 5.0, ENDED_S + 5.0))
-        assert self.left(folder, 5.0) == 9.0
-        assert self.left(folder, 25.0) == pytest.approx(9.0 / np.e)
+        assert self.left(folder, -60.0) == 9.0
+        assert self.left(folder, -40.0) == pytest.approx(9.0 / np.e)
+        assert "gone.mcap" in self.why
+
+    def test_a_damaged_state_leaves_it_as_hot_as_can_be(self, folder, states, caplog):
+        folder.begin("damaged", coil=coil(1.0))
+        (path,) = states.iterdir()
+        path.write_bytes(b"")
+        os.utime(path, (ENDED_S, ENDED_S))
+        assert self.left(folder, 0.0) == 9.0
+        assert self.left(folder, 20.0) == pytest.approx(9.0 / np.e)
+        assert str(path) in self.why
+        loaded = folder.loaded(*HOT)
+        assert any(str(path) in each for each in check(loaded, now=at(ENDED_S)).warnings)
+        assert check(loaded, now=at(ENDED_S)).heat_a2 == 9.0
+        assert str(path) in left_by_last_run(loaded, at(ENDED_S))[1]
+        sine = "waveform={kind: sine, unit: A, amplitude: 5.0, frequency_hz: 10.0, duration_s: 2.0}"
+        with pytest.raises(ConfigError):
+            check(folder.loaded(*HOT, "compensator=none", sine), now=at(ENDED_S))
+        assert str(path) in caplog.messages[-1]
+        # Long after, it makes no difference.
+        assert (self.left(folder, 1e4), self.why) == (pytest.approx(0.0), "")
+
+    def test_the_hottest_of_several_counts(self, folder):
+        folder.begin("one", coil=coil(4.0))
+        folder.begin("two", coil=coil(2.0), holds=HOLDS[1:])
+        folder.begin("three", coil=coil(8.0), holds=("tcp:10.0.0.6:502",))
+        assert self.left(folder, 0.0) == 4.0
+
+    @pytest.mark.parametrize("set_s", [600.0, -366 * 86400.0])
+    def test_a_clock_that_was_set_does_not_cool_the_coil(self, folder, set_s):
+        folder.begin("one", coil=coil(4.0), boot="b", boot_s=100.0)
+        now = MachineTime(ENDED_S + set_s, 120.0, "b")
+        assert heat_before(folder.loaded(*HOT), now) == (pytest.approx(4.0 / np.e), ())
+        rebooted = MachineTime(ENDED_S + set_s, 20.0, "c")
+        assert heat_before(folder.loaded(*HOT), rebooted)[0] >= 4.0 / np.e
 
     def test_a_run_that_would_overheat_the_coil_is_refused_until_it_has_cooled(self, folder):
         folder.begin("gone", coil=coil(8.9))
         sine = "waveform={kind: sine, unit: A, amplitude: 5.0, frequency_hz: 10.0, duration_s: 2.0}"
         loaded = folder.loaded(*HOT, "compensator=none", sine)
         with pytest.raises(ConfigError, match=r"2\.98 A .*wait"):
-            check(loaded, 0.0, ENDED_S)
-        later = check(loaded, 0.0, ENDED_S + 60.0)
+            check(loaded, 0.0, at(ENDED_S))
+        later = check(loaded, 0.0, at(ENDED_S + 60.0))
         assert later.heat_a2 == pytest.approx(8.9 * np.exp(-3.0))
         with pytest.raises(ConfigError, match="rms_current_a"):
-            check(loaded, 8.9, ENDED_S + 60.0)
+            check(loaded, 8.9, at(ENDED_S + 60.0))
+
+
+class TestRecoveredRun:
+    """A killed run leaves the state that its recovered recording shows."""
+
+    NOW = MachineTime(ENDED_S, 500.0, "b")
+
+    def left(self, folder, boot_s=900.0, boot="b", **end):
+        limits = folder.loaded(*HOT).config.limits
+        facts = {
+            "started": STARTED.isoformat(),
+            "limits": limits.model_dump_json(exclude_none=True),
+            HEAT_FACT: "4.0",
+        }
+        path = folder.record("a", facts=facts, end=end)
+        folder.begin("a", boot=boot, boot_s=boot_s)
+        finish_state(path, self.NOW)
+        path.unlink()
+        (run,) = last_runs(folder.loaded().device.info)
+        sure = CoilHeat(limits, RATE_HZ, 4.0)
+        sure.add(COMMAND)
+        return run.state, sure.heat_a2
+
+    def test_its_heat_is_that_of_its_samples(self, folder):
+        state, heat_a2 = self.left(folder, code="fault", output_safe="true")
+        assert state.coil.heat_a2 == pytest.approx(heat_a2)
+        assert (state.coil.output_safe, state.boot_s) == (True, 500.0)
+        assert state.coil.ended.timestamp() == pytest.approx(STARTED.timestamp() + 0.1)
+
+    @pytest.mark.parametrize("end", [{"output_safe": "false"}, {"code": "recovered"}])
+    def test_without_a_known_end_it_is_unknown_and_ended_by_now(self, folder, end):
+        state, _ = self.left(folder, **end)
+        assert (state.coil, state.boot_s) == (None, 500.0)
+
+    def test_one_of_an_earlier_boot(self, folder):
+        state, heat_a2 = self.left(folder, boot="a", output_safe="true")
+        assert (state.boot, state.boot_s) == ("a", 900.0)
+        assert state.coil.heat_a2 == pytest.approx(heat_a2)
+
+    def test_a_state_that_is_known_stays(self, folder):
+        path = folder.record("a", coil=coil(2.0), end={"output_safe": "true"})
+        finish_state(path, self.NOW)
+        finish_state(folder.runs / "absent.mcap", self.NOW)
+        (run,) = last_runs(folder.loaded().device.info)
+        assert run.state.coil == coil(2.0)

@@ -17,7 +17,7 @@ from mcap.writer import MCAP0_MAGIC
 from hilctl.base.errors import InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, BlockHeader
-from hilctl.experiment.device_state import read_device_state
+from hilctl.experiment.state_files import MachineTime, last_runs
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.recording.reader import read
 from hilctl.recording.run_summary import read_ends
@@ -148,18 +148,23 @@ def test_a_disk_that_can_not_keep_the_recording_is_an_error(begun, monkeypatch):
 def test_the_state_of_the_device_names_the_run_and_how_it_ended(checked, tmp_path):
     """From its beginning on: a run that is killed must not leave the device to the one before."""
     device = checked.loaded.device
-    real = SimpleNamespace(info=replace(device.info, holds=("tcp:10.0.0.5:502",)))
+    info = replace(device.info, holds=("tcp:10.0.0.5:502",), output="7:DAC1")
+    real = SimpleNamespace(info=info)
     checked = replace(checked, heat_a2=4.0, loaded=replace(checked.loaded, device=real))
     made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
     made.begin(10**18, {})
     made.note_device()
-    begun = read_device_state(real.info.holds)
+    made.await_noted()
+    (begun,) = (run.state for run in last_runs(real.info))
     run_id = read_ends(made.path).run["run_id"]
     assert (begun.run_id, begun.recording, begun.coil) == (run_id, str(made.path), None)
     assert begun.started.timestamp() == 1e9
+    assert begun.boot_s > MachineTime.now().boot_s  # when it ends at the latest
     made.batch(batch(0, 20))
     assert made.finish({**END, "output_safe": "true"}, 200)
-    ended, facts = read_device_state(real.info.holds), read(made.path).end
+    (ended,), facts = (run.state for run in last_runs(real.info)), read(made.path).end
+    assert (ended.boot, ended.output) == (MachineTime.now().boot, "7:DAC1")
+    assert ended.boot_s <= MachineTime.now().boot_s
     assert ended.run_id == run_id
     assert ended.coil.output_safe
     assert ended.coil.heat_a2 == float(facts["coil_heat_a2"])
@@ -167,6 +172,29 @@ def test_the_state_of_the_device_names_the_run_and_how_it_ended(checked, tmp_pat
         abs(ended.coil.ended.timestamp() - datetime.fromisoformat(facts["ended"]).timestamp())
         < 2e-3
     )
+
+
+def test_a_state_whose_disk_hangs_delays_no_recording(checked, tmp_path, monkeypatch, caplog):
+    """Both writes of the state wait, in order, for a network folder that is gone."""
+    released, written = threading.Event(), []
+
+    def write(state):
+        released.wait(60.0)
+        written.append(state.coil is not None)
+
+    monkeypatch.setattr(recorder, "write_state", write)
+    info = replace(checked.loaded.device.info, holds=("tcp:10.0.0.5:502",))
+    loaded = replace(checked.loaded, device=SimpleNamespace(info=info))
+    made = Recorder(replace(checked, loaded=loaded), tmp_path / "run.mcap", overwrite=False)
+    made.begin(10**18, {})
+    made.note_device()
+    made.batch(batch(0, 20))
+    assert made.finish({**END, "output_safe": "true"}, 200, patience_s=0.01)
+    assert (read(made.path).end["code"], written) == (END["code"], [])
+    assert "hangs" in caplog.messages[-1]
+    released.set()
+    made.await_noted(60.0)
+    assert written == [False, True]
 
 
 def test_a_recording_that_is_not_finished_leaves_the_device_s_end_open(begun):

@@ -3,7 +3,9 @@
 import signal
 import threading
 import time
+from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import pytest
 
@@ -51,6 +53,22 @@ def test_a_folder_that_can_not_be_made_is_said(tmp_path):
     checked = checked_experiment(DEMO, [f"recording.folder={tmp_path / 'file' / 'runs'}"])
     with pytest.raises(InputError, match="Not a directory"):
         output_of(checked, None)
+
+
+@pytest.mark.parametrize("holds", [("tcp:10.0.0.5:502",), ()])
+def test_a_killed_run_of_a_device_is_recovered_before_its_state_is_read(monkeypatch, holds):
+    done = []
+
+    def load(*given):
+        loaded = load_experiment(*given)
+        device = SimpleNamespace(info=replace(loaded.device.info, holds=holds))
+        return replace(loaded, device=device)
+
+    monkeypatch.setattr(start, "load_experiment", load)
+    monkeypatch.setattr(start, "finish_dead_runs", lambda: done.append("recovered"))
+    monkeypatch.setattr(start, "check", lambda *given: done.append("checked"))
+    checked_experiment(DEMO, [])
+    assert done == ["recovered"] * bool(holds) + ["checked"]
 
 
 BUDGET = ["limits.rms_current_a=2.0", "limits.thermal_time_constant_s=1.0"]

@@ -4,6 +4,7 @@ import time
 from dataclasses import replace
 from types import SimpleNamespace
 
+from hilctl.experiment.state_files import MachineTime
 from hilctl.run.start import unpaced
 
 RECORDED = {}
@@ -21,7 +22,7 @@ class StudyRig:
         self.time_s = time.time()
         self.observers = {
             "run": self,
-            "now_s": lambda: self.time_s,
+            "now": self.now,
             "sleep_s": self.sleep,
             "on_progress": lambda done, text: self.texts.append((done, text)),
         }
@@ -41,6 +42,9 @@ class StudyRig:
         output.write_bytes(recording)
         self.time_s += result.samples / self.rate_hz
         return replace(result, path=output, **(self.ends if fails else {}))
+
+    def now(self):
+        return MachineTime(self.time_s, self.time_s)
 
     def sleep(self, seconds):
         self.pauses.append(seconds)

@@ -151,10 +151,17 @@ def test_a_name_server_that_is_silent_is_not_waited_for(names, monkeypatch):
 
     monkeypatch.setattr(socket, "getaddrinfo", getaddrinfo)
     monkeypatch.setattr(resource_names, "_LOOKUP_S", 0.01)
-    for _ in range(2):
-        assert held_address("dac.lab", 502) == ("tcp:dac.lab:502",)
+    assert held_address("dac.lab", 502) == ("tcp:dac.lab:502",)
     assert asked == ["dac.lab"]
     answered.set()
+
+
+def test_a_missing_answer_is_not_kept_and_an_answer_is(names):
+    assert held_address("dac.lab", 502) == ("tcp:dac.lab:502",)
+    names["dac.lab"] = ["10.0.0.5"]
+    assert held_address("dac.lab", 502) == ("tcp:dac.lab:502", "tcp:10.0.0.5:502")
+    del names["dac.lab"]
+    assert held_address("dac.lab", 502) == ("tcp:dac.lab:502", "tcp:10.0.0.5:502")
 
 
 def test_links_to_a_port_are_the_port(tmp_path):

@@ -43,7 +43,7 @@ def run(campaign, tmp_path):
     def go(rig, text=CAMPAIGN, host=None):
         folder = tmp_path / "runs"
         folder.mkdir(exist_ok=True)
-        plan = planned_in_real_time(campaign(text), folder, rig.time_s)
+        plan = planned_in_real_time(campaign(text), folder, rig.now())
         return run_series(plan, host or rig.host)
 
     return go
