@@ -14,6 +14,7 @@ from hilctl.base.strict import BeforeValidator, Field, StrictModel, model_valida
 from hilctl.base.types import F64, CommandUnit
 
 _POINTS = 1025  # of a polynomial: the error is below 1e-6 of the range
+_LEAST_RATIO, _MOST_RATIO = 0.5, 2.0  # beyond, a unit or a sensitivity is wrong
 
 
 def _date(value: object) -> date:
@@ -59,6 +60,7 @@ class SensorCalibration(CalibrationOrigin):
     table: Annotated[tuple[tuple[float, float], ...], Field(min_length=2)] | None = None
 
     @model_validator(mode="after")
+    @np.errstate(over="ignore", invalid="ignore")  # refused here
     def _rises(self) -> Self:
         if (self.polynomial is None) == (self.table is None):
             raise ValueError("must have one of polynomial and table")
@@ -68,12 +70,19 @@ class SensorCalibration(CalibrationOrigin):
             inside = f" within the table's readings, {first:g} to {last:g}" if self.table else ""
             raise ValueError(f"range_um must rise{inside}, got [{low:g}, {high:g}]")
         for name, values in zip(("readings", "displacements"), self.points, strict=True):
-            if not (np.diff(values) > 0.0).all():
+            if not (np.isfinite(values).all() and (np.diff(values) > 0.0).all()):
                 rule = "if they fall, reverse the sign of device.sensor"
                 raise ValueError(
                     f"{'table' if self.table else 'polynomial'}: {name} must rise in "
                     f"range_um ({rule})"
                 )
+        ends = np.interp(self.range_um, *self.points)
+        if not _LEAST_RATIO <= (ratio := float(np.ptp(ends)) / (high - low)) <= _MOST_RATIO:
+            span = f"{_LEAST_RATIO:g} to {_MOST_RATIO:g}"
+            raise ValueError(
+                f"the true displacement must span {span} times the readings in range_um, got "
+                f"{ratio:.3g} (check the columns, use um for both, or correct device.sensor)"
+            )
         return self
 
     @property
