@@ -25,9 +25,17 @@ Devices are in ``hilctl_drivers``, which imports ``base`` and ``kernels`` only.
 """
 
 import os
+import sys
+import time
 
 __version__ = "0.2.0"
 
 # The matrices here are small: more BLAS threads make a fit many times slower on a busy machine, and
 # the loop's process must not have any. It takes effect where numpy is not imported yet.
 os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+
+try:
+    time.time()
+except OverflowError:  # Python itself cannot import its logging then
+    sys.stderr.write("hilctl: the clock must be before the year 2262: set this computer's clock\n")
+    raise SystemExit(2) from None

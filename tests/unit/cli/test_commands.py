@@ -31,6 +31,13 @@ def test_missing_command_is_an_input_error(module, monkeypatch):
         load("emulate")
 
 
+def test_a_clock_that_python_cannot_read_is_one_message():
+    code = f"import time\ndef far(): raise OverflowError\ntime.time = far\n{MAIN}"
+    ended = in_a_process(code, "list")
+    assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
+    assert ended.stderr.startswith("hilctl: ")
+
+
 def test_similar_command_is_suggested():
     ended = in_a_process(MAIN, "stauts")
     assert "'status'" in ended.stderr

@@ -262,6 +262,7 @@ def test_a_calibration_of_more_than_a_year_ago_is_told(tmp_path, now, warnings):
     info = loaded(CURRENT, f"device.calibration={path}").device.info
     now_s = datetime.fromisoformat(f"{now}T12:00+00:00").timestamp()
     assert len(calibration_warnings(info, now_s)) == warnings
+    assert len(calibration_warnings(info, 1e12)) == 1  # as a campaign asks, after the year 9999
 
 
 @pytest.mark.parametrize(("block", "problems"), [(58, 1), (580, 0)])
