@@ -2,6 +2,7 @@
 
 import os
 import signal
+import time
 from pathlib import Path
 
 import numpy as np
@@ -9,6 +10,7 @@ import pytest
 import yaml
 
 from hilctl.experiment.state_files import DeviceState, MachineTime
+from hilctl.recording.run_summary import read_ends
 from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.start import checked_experiment
 from hilctl.run.supervisor import Supervisor
@@ -152,6 +154,24 @@ def test_dead_host_is_noticed_by_the_device(emulate, run):
     assert not orphan.safe
     assert (left().coil, left().boot_s <= MachineTime.now().boot_s) == (None, True)
     assert begun.boot_s > left().boot_s
+
+
+def test_a_killed_supervisor_leaves_the_heat_of_the_coil(emulate, run):
+    """The next command computes it from the recovered samples, before it reads the state."""
+    device = emulate("labjack_t7")
+    started = run(over_tcp(device.address))
+    device.log.await_events("DAC0", FAULT_AT, started.process)
+    started.process.kill()
+    started.process.communicate(timeout=240)
+    device.log.await_output("DAC0", 0.0)
+    until_s = time.monotonic() + 30.0
+    while not (found := recover_dead_runs()) and time.monotonic() < until_s:
+        time.sleep(0.1)
+    assert found[0].safe
+    state = left()
+    assert (state.recording, state.coil.output_safe) == (str(started.output), True)
+    assert state.boot_s <= MachineTime.now().boot_s
+    assert read_ends(started.output).end["code"] == "stopped"
 
 
 def test_second_run_on_the_same_device_is_refused(emulate, run):
