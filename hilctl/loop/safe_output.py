@@ -24,7 +24,7 @@ OutputState: TypeAlias = Literal["confirmed", "set", "sent", "unknown"]
 
 Code: TypeAlias = Literal["completed", "stopped", "fault"]
 
-PATIENCE_S = 5.0
+PATIENCE_S = 4.0
 """How long a command waits for confirmation before the guardian takes over."""
 _RAMP_S = 0.005
 _RETRY_S = 0.05

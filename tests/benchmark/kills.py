@@ -18,7 +18,6 @@ from dataclasses import asdict, dataclass
 from pathlib import Path
 
 from hilctl.base.errors import HilctlError
-from hilctl.loop.safe_output import HOLD_S
 from hilctl.recording.reader import read
 from hilctl.run.shared.shared_page import PageField, Phase, SharedPage
 from tests.benchmark.attacked import (
@@ -34,13 +33,16 @@ from tests.benchmark.other_reader import verdict
 
 SLOW_WRITE = Path(__file__).with_name("slow_write.c")
 OBSERVED_S = 1.0
-END_S = HOLD_S + 30.0
+SAFE_A = 2e-3
+END_S = 60.0
+READABLE_S = 5.0
 STAYS = ", does not end"
 MODULES = {"loop": b"hilctl.run.loop_process", "guardian": b"hilctl.run.safety.guardian"}
-PHASES = ("start", "ramp in", "condition", "run", "set", "ramp out", "close", "recovery")
+PHASES = ("start", "ramp in", "condition", "run", "set", "away", "ramp out", "close", "recovery")
 TARGETS = (
     *("loop", "guardian", "supervisor"),
     *("loop+guardian", "loop+supervisor", "guardian+supervisor"),
+    "loop+guardian+supervisor",
 )
 SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 
@@ -56,7 +58,9 @@ class Attack:
         beyond_ramp_s: Time until the output stayed at its safe value, from the attack or, if the
             loop was to go on, from the end of the run, less what the safe ramp takes.
         largest_step: Largest step from then on, over what the safe ramp may move meanwhile.
+        readable_s: Time from the end of the attack until the recording was complete.
         reader: What another reader says against the recording; empty if it agrees.
+        is_false: Whether "confirmed" was recorded of an output that was not at its safe value.
     """
 
     phase: str
@@ -64,12 +68,15 @@ class Attack:
     lost: int
     beyond_ramp_s: float
     largest_step: float
+    readable_s: float
     reader: str
+    is_false: bool
 
     def is_good(self, within_s: float, max_step: float) -> bool:
         """Return whether nothing was lost, the output was safe in time, and the readers agree."""
         safe = self.beyond_ramp_s <= within_s and self.largest_step <= max_step
-        return self.lost == 0 and safe and not self.reader and not self.hit.endswith(STAYS)
+        recorded = self.lost == 0 and not self.reader and self.readable_s <= READABLE_S
+        return recorded and safe and not self.is_false and not self.hit.endswith(STAYS)
 
 
 def _children(supervisor: int) -> dict[str, int]:
@@ -110,6 +117,8 @@ def _await(run: AttackedRun, phase: str, chance: random.Random) -> tuple[SharedP
         time.sleep(ramp_s if phase == "condition" else 0.0)
         return page, 0.6 if phase == "condition" else ramp_s
     run.await_(lambda: _in_waveform(page))
+    if phase == "away":  # it executes what is sent meanwhile when it returns
+        os.kill(run.emulator.pid, signal.SIGSTOP)
     if phase == "set":
         run.hilctl("set", "gain=0.5", "--over", "0.5", stdout=subprocess.DEVNULL).wait(LONGEST_S)
         return page, 0.7
@@ -123,12 +132,12 @@ def _await(run: AttackedRun, phase: str, chance: random.Random) -> tuple[SharedP
 
 def attack(
     run: AttackedRun, phase: str, targets: str, actions: list[str], chance: random.Random
-) -> tuple[str, int, int | None, float]:
+) -> tuple[str, int, int | None, float, float]:
     """Hit processes of a run in a phase, each by one of the actions, and let it end.
 
     Returns:
-        What was done, when, when the output was to become safe (None for not at all), and up to
-        when the loop could put out samples.
+        What was done, when, when the output was to become safe (None for not at all), up to when
+        the loop could put out samples, and how long the recording took to become complete.
     """
     page, lasts_s = _await(run, phase, chance)
     time.sleep(chance.uniform(0.0, lasts_s))
@@ -151,13 +160,19 @@ def attack(
     for number in (signal.SIGCONT, signal.SIGTERM):  # a supervisor that was stopped ends its run
         with suppress(ProcessLookupError):
             run.process.send_signal(number)
-    said += _await_end(run)
+    began_s = time.monotonic()
+    _await_supervisor(run)
     run.recover()
+    readable_s = time.monotonic() - began_s
+    os.kill(run.emulator.pid, signal.SIGCONT)
+    return_ns = time.monotonic_ns()
+    said += _await_end(run, page)
     ends = "loop" in plan or plan.get("supervisor") == "kill" or phase in {"ramp out", "close"}
-    due_ns = hit_ns if ends else stop_ns
+    due_ns = return_ns if phase == "away" else hit_ns if ends else stop_ns
     # Without the start signal the loop has sent nothing, and the output stays as it was.
-    moved = page.get(PageField.GO) != 0
-    return said, hit_ns, due_ns if moved else None, hit_ns if "loop" in plan else 1e30
+    driven = page.get(PageField.GO) != 0 and list(plan.values()).count("kill") < len(processes)
+    until_ns = hit_ns if "loop" in plan else 1e30
+    return said, hit_ns, due_ns if driven else None, until_ns, readable_s
 
 
 def _hit_recovery(run: AttackedRun, chance: random.Random) -> str:
@@ -173,31 +188,45 @@ def _hit_recovery(run: AttackedRun, chance: random.Random) -> str:
     return f"{what} the next command"
 
 
-def _await_end(run: AttackedRun) -> str:
-    """Wait until all processes are gone, and return STAYS if they are not; then they are killed.
+def _await_supervisor(run: AttackedRun) -> None:
+    """Wait until the command of the run has ended, for a limited time."""
+    with suppress(subprocess.TimeoutExpired):
+        run.process.wait(END_S)
 
-    A process that is stopped continues once the supervisor has ended.
+
+def _await_end(run: AttackedRun, page: SharedPage) -> str:
+    """Wait until all processes are gone but a guardian that holds the safe value.
+
+    Return STAYS if they are not. The guardian is ended, as a user does. A process that is stopped
+    continues once the supervisor has ended.
     """
     deadline = time.monotonic() + END_S
     while left := run.processes():
         ended = run.process.poll() is not None
+        for each in left if ended else []:
+            with suppress(ProcessLookupError):
+                os.kill(each, signal.SIGCONT)
+        result = page.safe_result()
+        if ended and result is not None and result.output == "set":
+            with suppress(ProcessLookupError):
+                os.kill(page.get(PageField.GUARDIAN_PID), signal.SIGTERM)
         if time.monotonic() > deadline:
             for each in left:
                 os.kill(each, signal.SIGKILL)
             return STAYS
-        for each in left if ended else []:
-            with suppress(ProcessLookupError):
-                os.kill(each, signal.SIGCONT)
         time.sleep(0.02)
     return ""
 
 
-def judged(run: AttackedRun, phase: str, done: tuple[str, int, int | None, float]) -> Attack:
-    said, hit_ns, due_ns, until_ns = done
-    log, samples, reader = run.log(), None, ""
+def judged(run: AttackedRun, phase: str, done: tuple[str, int, int | None, float, float]) -> Attack:
+    said, hit_ns, due_ns, until_ns, readable_s = done
+    log, samples, reader, is_false = run.log(), None, "", False
     if due_ns is not None or (run.output.exists() and run.output.stat().st_size):
         try:
-            samples = read(run.output).samples
+            recording = read(run.output)
+            samples = recording.samples
+            confirmed = recording.end.get("output_state") == "confirmed"
+            is_false = confirmed and abs(log.current_a[-1]) > SAFE_A
             reader = verdict(run.output, samples.command.size)
         except HilctlError as error:
             reader = str(error)
@@ -207,7 +236,9 @@ def judged(run: AttackedRun, phase: str, done: tuple[str, int, int | None, float
         lost=log.lost(samples, until_ns),
         beyond_ramp_s=0.0 if due_ns is None else log.beyond_ramp_s(due_ns),
         largest_step=log.largest_step(hit_ns if due_ns is None else due_ns),
+        readable_s=readable_s,
         reader=reader,
+        is_false=is_false,
     )
 
 
@@ -223,14 +254,17 @@ def _slow_disk(folder: Path, stall_s: float) -> dict[str, str]:
 
 def print_table(found: list[tuple[str, Attack]]) -> None:
     """Print a line for each phase and each group of processes."""
-    print(f"{'attack':<32} runs  lost  to safe beyond ramp  largest step  readable")
+    head = "runs  lost  to safe beyond ramp  largest step  readable, after  false confirmed"
+    print(f"{'attack':<40} {head}")
     for name, group in itertools.groupby(sorted(found, key=lambda each: each[0]), lambda e: e[0]):
         rows = [each for _, each in group]
         readable = sum(not each.reader for each in rows)
         print(
-            f"{name:<32} {len(rows):4} {sum(each.lost for each in rows):5}"
+            f"{name:<40} {len(rows):4} {sum(each.lost for each in rows):5}"
             f" {1e3 * max(each.beyond_ramp_s for each in rows):17.0f} ms"
             f" {max(each.largest_step for each in rows):13.2f} {readable:4} of {len(rows)}"
+            f" {max(each.readable_s for each in rows):5.1f} s"
+            f" {sum(each.is_false for each in rows):16}"
         )
 
 

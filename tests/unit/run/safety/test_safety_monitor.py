@@ -170,7 +170,7 @@ def acting(run, page, **result):
 def test_a_guardian_that_keeps_trying_is_left_to_it(run, page):
     acting(run, page, output="unknown", error="no answer")
     run.look(ended=True)
-    run.look(ended=True, passed_ms=5_000)
+    run.look(ended=True, passed_ms=4_000)
     assert run.safety.result is None
     run.look(ended=True, passed_ms=200)
     assert (run.safety.result.output, run.safety.by) == ("unknown", "guardian")
@@ -194,7 +194,7 @@ def unconfirmed(run):
     """A run whose guardian is dead, and whose device does not answer the supervisor."""
     run.guardians[0].ended, run.error = True, DeviceError("no answer")
     run.look(ended=True)
-    run.look(ended=True, passed_ms=5_200)
+    run.look(ended=True, passed_ms=4_200)
     assert (run.safety.result.output, run.safety.by) == ("unknown", "supervisor")
     return run
 
