@@ -11,9 +11,8 @@ from collections.abc import Callable
 from contextlib import suppress
 from typing import Annotated, Any
 
-import numpy as np
 import typer
-from rich.console import Group, RenderableType
+from rich.console import Group
 from rich.live import Live
 from rich.text import Text
 
@@ -24,7 +23,6 @@ from hilctl.cli.console import console
 from hilctl.cli.options import AsJson, run_names
 from hilctl.cli.output import print_json, safe_streams
 from hilctl.live.run_reader import RunList, RunReader
-from hilctl.live.scope import ROW, WINDOWS_S
 from hilctl.live.server_process import SingleRun, serve_runs
 from hilctl.run.control.client import (
     JOB_CONTROL,
@@ -37,7 +35,7 @@ from hilctl.run.control.client import (
 from hilctl.run.run_folder import RunFolder, require_linux, runs
 
 _FRAME_S, _SEARCH_S, _OVER_S = 0.15, 0.05, 0.5
-_LINE_FRAMES, _EVENTS, _MIN_WIDTH, _MIN_HEIGHT = 7, 3, 40, 14
+_LINE_FRAMES, _OTHER_LINES = 7, 6  # lines of the screen that are not events
 _FIGURES = (
     ("hyst.", "peak_hysteresis_percent", "%"),
     ("peak", "peak_error_percent", "%"),
@@ -120,7 +118,6 @@ class View:
     def __init__(self, feed: RunReader) -> None:
         self.feed, self.message, self.left = feed, "", False
         self._mark: str | None = None  # while it is typed
-        self._window, self._triggered = 1, True
 
     def show(self) -> None:
         """Show the run until it ends or ``q`` is pressed, then restore the terminal."""
@@ -134,7 +131,7 @@ class View:
             with Live(console=terminal, screen=True, auto_refresh=False) as live:
                 while not (self.left or self.feed.ended):
                     self.feed.poll(time.monotonic())
-                    live.update(self.screen(*terminal.size), refresh=True)
+                    live.update(self.screen(terminal.height), refresh=True)
                     if select.select([keyboard], [], [], _FRAME_S)[0]:
                         self.press(os.read(keyboard, 256) or b"q")  # end of input
         finally:
@@ -152,11 +149,6 @@ class View:
             self._ask("stop", request_stop)
         elif key == "m":
             self._mark = ""
-        elif key == "t":
-            self._triggered = not self._triggered
-        elif key in "[]":
-            wanted = self._window + (1 if key == "]" else -1)
-            self._window, self._triggered = min(len(WINDOWS_S) - 1, max(0, wanted)), False
         elif key in "+-":
             gain = round(self.feed.status()["gain"] + float(key + "0.1"), 6)
             self._ask(f"gain {gain:g}", set_run, gain=gain, over_s=_OVER_S)
@@ -185,49 +177,23 @@ class View:
         self.message = f"{what}: requested"
         threading.Thread(target=ask, daemon=True).start()  # a stop must not wait for a change
 
-    def screen(self, width: int, height: int) -> Group:
-        """Return the screen of the run, without plots if the terminal is small."""
+    def screen(self, height: int) -> Group:
+        """Return the screen of the run, with as many of the newest events as fit."""
         status, mark = self.feed.status(), self._mark
-        events = [_event(each, self.feed) for each in self.feed.events[-_EVENTS:]]
-        lines = [
+        rows = max(1, height - _OTHER_LINES)
+        events = [_event(each, self.feed) for each in self.feed.events[-rows:]]
+        lines = (
             f"{printable(status['run'])}  {status['state']}  {status['t_s']:.1f}/"
             f"{status['total_s']:.1f} s  inverse {status['inverse'] or 'none'}  "
             f"gain {status['gain']:g}  offset {status['offset']:g}",
             *_facts(status),
             "limits: "
             + "  ".join(f"{g['name']} {g['used'] * 100:.0f} %" for g in status["gauges"]),
-            *events + [""] * (_EVENTS - len(events)),
+            *events + [""] * (rows - len(events)),
             self.message if mark is None else f"mark: {mark}_   (Enter sets it, Esc cancels)",
-            "s stop  i inverse  +- gain  m mark  t trigger  [] time  q leave",
-        ]
-        shown: list[RenderableType] = [Text(e, no_wrap=True, overflow="ellipsis") for e in lines]
-        if width >= _MIN_WIDTH and height >= _MIN_HEIGHT:
-            shown.insert(1, self._plots(width, height - len(lines)))
-        return Group(*shown)
-
-    def _plots(self, width: int, height: int) -> Text:
-        from plotext import figure, marker  # import takes 0.25 s
-
-        scope, window_s = self.feed.scope, WINDOWS_S[self._window]
-        cycles = scope.triggered() if self._triggered else None
-        window = cycles or scope.rolling(window_s)
-        scale, second = (1e3, "ms") if window.t_s[-1] - window.t_s[0] < 1.0 else (1.0, "s")
-        unit = "um" if self.feed.loop_input == "reference" else self.feed.description.command_unit
-        figure.clear().subplots(1, 2).plot_size(width, height).theme("colorless")
-        shown = "newest cycles" if cycles else f"last {window_s:g} s"
-        figure.subplot(1, 1).title(f"{shown}, axis in {second}")
-        figure.subplot(1, 2).title(f"against {self.feed.loop_input}, {unit}")
-        curves = [(2, *scope.loops(), "orange")]
-        for name, colour in (("reference", "blue"), ("displacement", "orange")):
-            ends = np.stack((window.buckets.low[ROW[name]], window.buckets.high[ROW[name]]))
-            curves.append((1, np.repeat(window.t_s * scale, 2), ends.T.ravel(), colour))
-        for column, x, y, colour in curves:
-            finite = np.isfinite(x) & np.isfinite(y)
-            if finite.any():
-                plot = figure.subplot(1, column)
-                curve = plot.signal(x[finite], y[finite], marker=marker("braille", colour))
-                plot.draw(curve.lines())
-        return Text.from_ansi(str(figure.build().string()).rstrip("\n"), no_wrap=True)
+            "s stop  i inverse  +- gain  m mark  q leave",
+        )
+        return Group(*(Text(each, no_wrap=True, overflow="ellipsis") for each in lines))
 
 
 def _facts(status: dict[str, Any]) -> tuple[str, str]:

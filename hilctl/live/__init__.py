@@ -4,5 +4,5 @@ A live view is not part of a run: it maps the run's ring read-only and sends cha
 control socket. Killing it does not affect the run.
 """
 
-PUBLIC = ("run_reader", "scope", "server_process")
+PUBLIC = ("run_reader", "server_process")
 """Modules that other rooms import; the others are private."""

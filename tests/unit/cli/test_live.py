@@ -8,7 +8,6 @@ import termios
 from contextlib import nullcontext
 from types import SimpleNamespace
 
-import numpy as np
 import pytest
 from rich.text import Text
 
@@ -17,7 +16,6 @@ from hilctl.base.events import Event
 from hilctl.cli import live as module
 from hilctl.cli.console import print_rich
 from hilctl.cli.live import View, print_lines
-from hilctl.live.scope import SIGNALS, WINDOWS_S, Buckets, ScopeWindow
 from hilctl.run.run_folder import run_folder
 
 
@@ -29,8 +27,6 @@ class FakeFeed:
         self.state, self.ended, self._polls = "running", False, polls
         self.description = SimpleNamespace(command_unit="A", sample_rate_hz=1000.0)
         self.events = [Event(1000 * k, "info", "mark", f"tap {k}") for k in range(5)]
-        t_s = np.linspace(0.0, 0.02, 300)
-        self.show(t_s, np.tile(40.0 * np.sin(628.0 * t_s), (len(SIGNALS), 1)))
         self.values = {
             "run": "demo-7", "state": "running", "reason": "", "t_s": 12.34, "total_s": 30.0,
             "inverse": inverse, "gain": 0.7, "offset": -2.0,
@@ -39,14 +35,6 @@ class FakeFeed:
             "lateness_us": {"p50": 3.0, "p99": 21.0, "max": 40.0}, "late_ticks": 9,
             "gauges": [{"name": "command", "used": 0.84}],
         }  # fmt: skip
-
-    def show(self, t_s, values):
-        """Replace the signals, which have no loop if there are fewer than 100 samples."""
-        window = ScopeWindow(t_s, Buckets(values, values, values))
-        loops = values[:2] if t_s.size > 100 else np.empty((2, 0))
-        self.scope = SimpleNamespace(
-            triggered=lambda: window, rolling=lambda s: window, loops=lambda: loops
-        )
 
     def status(self):
         return self.values
@@ -80,8 +68,8 @@ def sent(monkeypatch):
     return asked
 
 
-def shown(view, capsys, width=80, height=24):
-    print_rich(view.screen(width, height))
+def shown(view, capsys, height=9):
+    print_rich(view.screen(height))
     return capsys.readouterr().out
 
 
@@ -151,31 +139,13 @@ def test_arrows_and_unknown_keys_do_nothing(sent):
     assert (sent, view.left) == (["stop"], True)
 
 
-def test_windows_can_be_selected(capsys):
-    view = View(FakeFeed())
-    assert "newest cycles" in shown(view, capsys)
-    view.press(b"]" * 20)
-    assert f"last {WINDOWS_S[-1]:g} s" in shown(view, capsys)
-    view.press(b"[" * 20)
-    assert f"last {WINDOWS_S[0]:g} s" in shown(view, capsys)
-    view.press(b"t")
-    assert "newest cycles" in shown(view, capsys)
-    view.feed.scope.triggered = lambda: None
-    assert f"last {WINDOWS_S[0]:g} s" in shown(view, capsys)
-
-
-@pytest.mark.parametrize("size", [(80, 24), (160, 50), (40, 14), (39, 24), (80, 5)])
-def test_screen_fits_the_terminal(size):
+@pytest.mark.parametrize(("height", "events"), [(5, 1), (7, 1), (9, 3), (24, 5)])
+def test_screen_fits_the_terminal(height, events, capsys):
     view = View(FakeFeed())
     view.message = "x" * 200
-    parts = view.screen(*size).renderables
-    width, height = size
-    plots = [each for each in parts if any(0x2800 < ord(c) < 0x2900 for c in each.plain)]
-    assert bool(plots) == (width >= 40 and height >= 14)
-    if plots:
-        lines = plots[0].plain.split("\n")
-        assert max(map(len, lines)) <= width
-        assert len(lines) + len(parts) - 1 <= height
+    lines = shown(view, capsys, height).splitlines()
+    assert len(lines) == max(7, height)
+    assert sum(" mark: tap" in line for line in lines) == events
 
 
 def test_the_screen_has_state_limits_figures_and_the_newest_events(capsys):
@@ -184,12 +154,6 @@ def test_the_screen_has_state_limits_figures_and_the_newest_events(capsys):
     for value in (*values.split("|"), "3.000 s  mark: tap 3", "tap 4"):
         assert value in text
     assert "tap 1" not in text
-
-
-def test_empty_signal_has_no_curve(capsys):
-    feed = FakeFeed()
-    feed.show(np.arange(3.0), np.full((len(SIGNALS), 3), np.nan))
-    assert not any(0x2800 < ord(each) < 0x2900 for each in shown(View(feed), capsys))
 
 
 def test_control_characters_are_escaped(monkeypatch, capsys):
@@ -246,7 +210,7 @@ def test_terminal_is_restored_on_every_exit(terminal, monkeypatch, way_out):
     before = termios.tcgetattr(sys.stdin.fileno())
     view = View(FakeFeed(polls=2 if way_out == "end" else 10**9))
 
-    def screen(width, height):
+    def screen(height):
         assert not termios.tcgetattr(sys.stdin.fileno())[3] & termios.ICANON
         if way_out == "q":
             os.write(user, b"q")
