@@ -67,7 +67,6 @@ class FigureSpec:
     panels: tuple[Panel, ...]
     alike: bool = False
     stacked: bool = False  # whether panels share the x axis, one below the other
-    most_beside: int = 3  # most panels side by side in two columns
 
 
 @mpl.rc_context(STYLE)
@@ -125,7 +124,7 @@ def _columns(sheet: FigureSpec, width: ColumnWidth) -> int:
     if width == "single":
         return 2 if sheet.alike and len(sheet.panels) > 2 else 1
     count = len(sheet.panels)
-    return min(2 if count == 4 else count, sheet.most_beside)
+    return min(2 if count == 4 else count, 3)
 
 
 def _legend(figure: Figure, drawn_axes: list[Axes], whole_mm: float) -> None:

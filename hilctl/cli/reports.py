@@ -173,7 +173,6 @@ def _minutes(report: RunReport) -> Table:
 def render_series(series: "RunSeries") -> Group:
     """Return the summary of several runs and a table of them."""
     from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table  # matplotlib
-    from hilctl.studies.multi_run.trend import headline
 
     headings, rows = run_table(series, MOST_ROWS, short=True)
     cells = [[printable(cell) for cell in row] for row in rows]
@@ -181,7 +180,7 @@ def render_series(series: "RunSeries") -> Group:
     problems = [Text(f"not read: {printable(each)}", "red") for each in series.missing]
     named = [] if series.is_campaign else [(run.number, run.recording) for run in series.runs]
     files = [Text(f"{number}: {printable(name)}") for number, name in named]
-    return Group(Text(printable(" ".join(headline(series)))), *problems, runs, *files)
+    return Group(Text(printable(series.headline)), *problems, runs, *files)
 
 
 def print_replay(result: "ReplayResult", *, other: Path | None) -> None:

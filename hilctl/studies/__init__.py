@@ -3,7 +3,7 @@
 PUBLIC = (
     "calibrate", "campaign.campaign_runner", "campaign.plan", "campaign.steps", "campaign.store",
     "characterise.characterisation_runner", "characterise.results", "characterise.rig_page",
-    "multi_run.collect", "multi_run.multi_run_page", "multi_run.plots", "multi_run.trend",
+    "multi_run.collect", "multi_run.multi_run_page", "multi_run.plots",
     "multi_run.varied_parameter", "step_runner",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -6,6 +6,7 @@ import json
 from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import takewhile
 from pathlib import Path
 from typing import Any
 
@@ -37,6 +38,7 @@ RESULT, RECORDING = "result", "recording"
 LAST = (RESULT, RECORDING)  # columns after the metrics
 COMPLETED = "completed"
 PLANNED = "planned"
+_MOST_FAILED = 3  # most failed runs in the headline
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,8 +81,8 @@ def _is_table(path: Path) -> bool:
 def read_entries(path: Path) -> list[SeriesRun]:
     """Return the rows of a campaign's table; raise DataError if one is invalid."""
     reader = csv.DictReader(io.StringIO(read_text(path), newline=""))
-    names = reader.fieldnames or ()
-    keys = [name for name in names if name not in {*FIRST, *FIGURES, *LAST}]
+    names = list(reader.fieldnames or ())[len(FIRST) :]
+    keys = list(takewhile(lambda name: name not in {*FIGURES, *LAST}, names))
     entries = []
     for row in reader:
         try:
@@ -178,6 +180,21 @@ class RunSeries:
     def planned(self) -> int:
         """Number of remaining runs."""
         return sum(run.result == PLANNED for run in self.runs)
+
+    @property
+    def headline(self) -> str:
+        """Number of runs, those that failed, and the drift of the reference runs."""
+        done = sum(run.completed for run in self.runs)
+        parts = [f"{done} of {len(self.runs)} runs completed"]
+        if self.failed:
+            shown = [f"{self.text(run)} ({run.result})" for run in self.failed[:_MOST_FAILED]]
+            left_out = len(self.failed) - len(shown)
+            more = f" and {left_out} more" if left_out else ""
+            parts.append(f"{len(self.failed)} failed: {'; '.join(shown)}{more}")
+        if self.planned:
+            parts.append(f"{self.planned} remaining")
+        drift = str(self.drift) if self.drift else ""
+        return f"{', '.join(parts)}." + (f" {drift[0].upper()}{drift[1:]}." if drift else "")
 
     def text(self, run: SeriesRun) -> str:
         """Return the label of a run among the others."""

@@ -23,7 +23,6 @@ from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import parse_model
 from hilctl.recording.metadata_keys import HEAT_FACT, LabelValue
 from hilctl.recording.recording import Recording
-from hilctl.studies.multi_run.minor_loops import minor_loops
 
 
 @dataclass(frozen=True, slots=True)
@@ -41,11 +40,6 @@ class RunFigures:
         high_um: Highest displacement of the average cycle.
         mean_um: Mean displacement of the average cycle.
         offset_um: Offset measured at rest and subtracted.
-        minor_low_um: Peak-to-peak displacement of the minor loops at the lowest input.
-        minor_high_um: The same of those at the highest input.
-        minor_low_percent: Peak hysteresis of the minor loops at the lowest input, of their own
-            peak-to-peak.
-        minor_high_percent: The same of those at the highest input.
         natural_hz: Natural frequency, from the ringing after a step or a multisine's response.
         damping_ratio: Its damping ratio.
         deadline_misses: Skipped ticks.
@@ -62,10 +56,6 @@ class RunFigures:
     high_um: float | None = None
     mean_um: float | None = None
     offset_um: float | None = None
-    minor_low_um: float | None = None
-    minor_high_um: float | None = None
-    minor_low_percent: float | None = None
-    minor_high_percent: float | None = None
     natural_hz: float | None = None
     damping_ratio: float | None = None
     deadline_misses: int | None = None
@@ -109,27 +99,12 @@ def _cycle_figures(recording: Recording, segment: Segment) -> dict[str, float]:
     part = steady_part(recording, segment)
     if part.cycle is None or not part.loop.size:
         return {}
-    loop_input, output = part.loop
-    found = {
+    output = part.loop[1]
+    return {
         "low_um": float(output.min()),
         "high_um": float(output.max()),
         "mean_um": float(output.mean()),
     }
-    return found | _minor(loop_input, output) if segment.is_loop else found
-
-
-def _minor(loop_input: F64, output: F64) -> dict[str, float]:
-    """Return averages over the minor loops in the lower and in the upper half of the input."""
-    middle = 0.5 * float(loop_input.min() + loop_input.max())
-    loops = minor_loops(loop_input, output)
-    found = {}
-    for name, sign in (("low", -1.0), ("high", 1.0)):
-        side = [loop for loop in loops if sign * (loop.middle - middle) > 0.0]
-        if side:
-            found[f"minor_{name}_um"] = float(np.mean([loop.peak_to_peak_um for loop in side]))
-            percents = [loop.peak_hysteresis_percent for loop in side]
-            found[f"minor_{name}_percent"] = float(np.mean(percents))
-    return found
 
 
 def _structure(recording: Recording) -> FrequencyResponse | StepResponse | None:

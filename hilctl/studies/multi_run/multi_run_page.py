@@ -21,7 +21,6 @@ from hilctl.studies.multi_run.trend import (
     STROKE,
     Trend,
     axis_name,
-    headline,
     trends,
 )
 from hilctl.studies.multi_run.varied_parameter import plain_text, texts_of
@@ -39,11 +38,9 @@ def write_series(series: RunSeries, path: Path) -> None:
 
 def series_page(series: RunSeries) -> str:
     """Return the page as HTML."""
-    first, *more = headline(series)
     sheets, left_out = sheets_of(series), len(series.runs) - MOST_ROWS
     body = [
-        html.paragraph(" ".join((first, *more[:2])), "headline"),
-        html.paragraph(" ".join(more[2:])) if more[2:] else "",
+        html.paragraph(series.headline, "headline"),
         *(html.paragraph(f"Not read: {problem}", "bad") for problem in series.missing),
         *(html.paragraph(f"{series.text(run)}: {run.result}", "bad") for run in series.failed),
         *_simulated(series),
@@ -170,7 +167,7 @@ def series_mapping(series: RunSeries) -> dict[str, Any]:
     """Return plain values for JSON; numbers that are not finite become None."""
     return {
         "name": series.name,
-        "headline": " ".join(headline(series)),
+        "headline": series.headline,
         "varied": [
             {"key": each.key, "name": each.name, "unit": each.unit, "values": list(each.values)}
             for each in series.dimensions

@@ -1,6 +1,6 @@
-"""Figures of trends, sensitivity and drift; selection and files of all figures."""
+"""Figures of trends; selection and files of all figures."""
 
-from collections.abc import Callable, Hashable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from functools import partial
 from pathlib import Path
 from textwrap import wrap
@@ -11,10 +11,9 @@ from matplotlib.axes import Axes
 from matplotlib.figure import Figure
 
 from hilctl.analysis.figure_layout import ColumnWidth, FigureSpec, Panel, drawn, write_figure
-from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, plain_numbers
+from hilctl.analysis.plot_style import QUIET, plain_numbers
 from hilctl.base.errors import InputError
 from hilctl.base.files import already_there, exists, make_folder
-from hilctl.base.formatting import unit_text
 from hilctl.studies.multi_run.collect import OnRead, RunSeries, SeriesRun
 from hilctl.studies.multi_run.run_plots import (
     before_after_sheet,
@@ -22,7 +21,6 @@ from hilctl.studies.multi_run.run_plots import (
     frequency_sheet,
     looks,
     loop_sheets,
-    minor_loop_sheet,
     model_sheet,
     spread,
     step_sheet,
@@ -30,12 +28,8 @@ from hilctl.studies.multi_run.run_plots import (
 from hilctl.studies.multi_run.trend import (
     AREA,
     ASYMMETRY,
-    DAMPING,
     HYSTERESIS,
-    MINOR_HIGH,
-    MINOR_LOW,
     MODEL_ERROR,
-    NATURAL,
     PEAK_ERROR,
     RMS_ERROR,
     STROKE,
@@ -51,9 +45,8 @@ _MANY = 10
 _HEADROOM = 1.08
 _LONGEST_NAME = 24
 _MOST_LINES = 9
-_FITTED = (AREA, HYSTERESIS, MINOR_LOW, MINOR_HIGH)
+_FITTED = (AREA, HYSTERESIS)
 _FIT = {"color": QUIET, "linewidth": 0.7, "linestyle": "--"}
-_MOST_BARS = 12
 
 
 def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
@@ -70,12 +63,6 @@ def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
             fits = "; dashed: linear fits" if along.is_frequency else ""
             caption = f"Stroke, area and peak hysteresis of the loops against {along.name}{fits}."
             yield FigureSpec(f"hysteresis_against_{name}", caption, panels)
-        minor = _trend_panels(
-            series, along, [MINOR_LOW, MINOR_HIGH], plain, fitted=along.is_frequency
-        )
-        if minor:
-            caption = f"Peak hysteresis of minor loops against {along.name}."
-            yield FigureSpec(f"minor_loops_against_{name}", caption, minor)
         compared = [HYSTERESIS, PEAK_ERROR, RMS_ERROR, MODEL_ERROR]
         left = _trend_panels(series, along, compared, None)
         if left and any(run.digest and run.digest.compensated for run in series.done):
@@ -147,114 +134,16 @@ def _looks(first: VariedParameter | None, found: Sequence[Trend]) -> list[dict[s
     return [dict(of[trend.held[first.key]]) for trend in found]
 
 
-def resonance_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return natural frequency and damping against a parameter; None without any."""
-    for along in series.dimensions:
-        found = trends(series, NATURAL, along) if along.numeric else []
-        if found:
-            panels = _trend_panels(series, along, [NATURAL, DAMPING], None)
-            caption = f"Natural frequency and damping against {along.name}."
-            return FigureSpec("resonance", caption, panels)
-    return None
-
-
-def sensitivity_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return the sensitivity of metrics to each parameter; None with fewer than two parameters.
-
-    Sensitivity is the change of the mean over all other parameters, in percent of the total mean.
-    """
-    numbers = [each for each in series.dimensions if len(each.values) > 1]
-    runs, figures = series.plain, (STROKE, HYSTERESIS, AREA)
-    if len(runs) < 2:
-        runs, figures = series.done, (HYSTERESIS, PEAK_ERROR, RMS_ERROR)
-    found = [(figure, _changes(figure, numbers, runs)) for figure in figures]
-    panels = tuple(
-        Panel(partial(_draw_bars, bars=bars), figure.text, 0.12 + 0.11 * len(bars))
-        for figure, bars in found
-        if len(bars) > 1
-    )
-    if not panels:
-        return None
-    caption = (
-        "Sensitivity: change of each metric over the range of a parameter, averaged over the "
-        "others, in percent of its mean."
-    )
-    return FigureSpec("sensitivity", caption, panels, most_beside=1)
-
-
-def _changes(
-    figure: RunFigure, dimensions: Sequence[VariedParameter], runs: Sequence[SeriesRun]
-) -> list[tuple[str, float]]:
-    values = figure.of(runs)
-    whole = float(np.mean([value for _, value in values])) if values else 0.0
-    found = []
-    for each in dimensions:
-        by: dict[Hashable, list[float]] = {}
-        for run, value in values:
-            by.setdefault(run.values.get(each.key), []).append(value)
-        if len(by) > 1 and whole > 0.0:
-            means = [float(np.mean(members)) for members in by.values()]
-            low, high = each.text(each.values[0]), each.text(each.values[-1])
-            name = "\n".join((each.name, *wrap(f"{low} to {high}", _LONGEST_NAME)))
-            found.append((name, 100.0 * float(np.ptp(means)) / whole))
-    return sorted(found, key=lambda bar: bar[1])[-_MOST_BARS:]
-
-
-def _draw_bars(axes: Axes, bars: Sequence[tuple[str, float]]) -> None:
-    axes.barh(
-        [name for name, _ in bars], [size for _, size in bars], color=DISPLACEMENT, height=0.6
-    )
-    for number, (_, size) in enumerate(bars):
-        axes.annotate(f"{size:.3g} %", (size, number), xytext=(3, 0), textcoords="offset points",
-                      va="center", fontsize=7)  # fmt: skip
-    axes.set(xlabel="change, %")
-    axes.margins(x=0.18)
-    axes.grid(axis="y", visible=False)
-
-
-def order_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return metrics in the order of the runs; None without reference runs."""
-    known = [run for run in series.runs if run.completed]
-    panels = tuple(
-        Panel(partial(_draw_order, figure=figure, runs=known), figure.text, 0.45)
-        for figure in (STROKE, HYSTERESIS, PEAK_ERROR)
-        if len(figure.of(known)) > 2
-    )
-    if not panels or not any(run.is_reference for run in known):
-        return None
-    caption = "Metrics in the order of the runs; a change of the reference runs is drift."
-    return FigureSpec("in_order", caption, panels, stacked=True)
-
-
-def _draw_order(axes: Axes, figure: RunFigure, runs: Sequence[SeriesRun]) -> None:
-    for is_reference, colour, sign, label in (
-        (False, ERROR, ".", "runs"),
-        (True, COMMAND, "D", "reference runs"),
-    ):
-        found = figure.of([run for run in runs if run.is_reference == is_reference])
-        if found:
-            x, y = zip(*((run.number, value) for run, value in found), strict=True)
-            line = "-" if is_reference else "none"
-            axes.plot(x, y, sign, linestyle=line, color=colour, markersize=3.5, label=label)
-            if is_reference:
-                axes.axhline(y[0], color=MARK, linewidth=0.7, linestyle=":")
-    axes.set(xlabel="step", ylabel=f"{figure.text}, {unit_text(figure.unit)}")
-
-
 def sheets_of(series: RunSeries) -> list[FigureSpec]:
     """Return all figures that apply, the most important first."""
     sheets = (
         before_after_sheet(series),
-        resonance_sheet(series),
         frequency_sheet(series),
         step_sheet(series),
         *trend_sheets(series),
         *loop_sheets(series),
-        minor_loop_sheet(series),
         model_sheet(series),
         error_sheet(series),
-        sensitivity_sheet(series),
-        order_sheet(series),
     )
     return [sheet for sheet in sheets if sheet is not None]
 

@@ -13,7 +13,6 @@ from matplotlib.axes import Axes
 from hilctl.analysis.figure_layout import FigureSpec, Panel
 from hilctl.analysis.plot_style import (
     DISPLACEMENT,
-    MARK,
     NAMED,
     PALE,
     QUIET,
@@ -25,7 +24,6 @@ from hilctl.analysis.response.bode import response_sheet
 from hilctl.base.formatting import quantity, significant
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.digest import RunDigest
-from hilctl.studies.multi_run.minor_loops import minor_parts
 from hilctl.studies.multi_run.varied_parameter import (
     WITHOUT_COMPENSATOR,
     VariedParameter,
@@ -130,17 +128,6 @@ def _draw_loops(axes: Axes, along: VariedParameter, runs: Sequence[Measured]) ->
         axes.set(xlabel=_input_axis(digest), ylabel=_DISPLACEMENT_AXIS)
 
 
-def minor_loop_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return loops with their minor loops, one panel per run; None without minor loops."""
-    runs = [
-        (run, digest)
-        for run, digest in series.measured
-        if digest.loop.size and (run.figures.minor_low_um or run.figures.minor_high_um)
-    ]
-    caption = "Minor loops, at reversals of the input within the cycle"
-    return _run_sheet("minor_loops", caption, series, runs, _draw_minor)
-
-
 def _run_sheet(
     name: str, caption: str, series: RunSeries, runs: Sequence[Measured], draw: Callable[..., None]
 ) -> FigureSpec | None:
@@ -151,14 +138,6 @@ def _run_sheet(
     )
     more = f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
     return FigureSpec(name, f"{caption}{more}.", panels, alike=True) if panels else None
-
-
-def _draw_minor(axes: Axes, digest: RunDigest) -> None:
-    loop = digest.loop
-    axes.plot(*loop, color=QUIET, linewidth=0.8, label="cycle")
-    for part in minor_parts(loop[0, :-1], loop[1, :-1]):
-        axes.plot(*part, color=MARK, linewidth=1.3, label="minor loop")
-    axes.set(xlabel=_input_axis(digest), ylabel=_DISPLACEMENT_AXIS)
 
 
 def model_sheet(series: RunSeries) -> FigureSpec | None:

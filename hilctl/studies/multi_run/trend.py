@@ -1,16 +1,16 @@
-"""Trends of metrics against varied parameters, and the headline of many runs."""
+"""Trends of metrics against varied parameters."""
 
 from collections import defaultdict
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Hashable, Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 
-from hilctl.base.formatting import quantity, significant, unit_text
+from hilctl.base.formatting import unit_text
 from hilctl.base.types import F64
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
-from hilctl.studies.multi_run.varied_parameter import VariedParameter, rank_of, texts_of
+from hilctl.studies.multi_run.varied_parameter import VariedParameter, rank_of
 
 _SPREAD = 0.02  # of the mean: less is no change
 _FEWEST = 3
@@ -41,8 +41,6 @@ AREA = _column("loop_area", "loop area", "um*A", "area")
 HYSTERESIS = _column("peak_hysteresis_percent", "peak hysteresis", "%", "hyst. %")
 PEAK_ERROR = _column("peak_error_percent", "peak error", "%", "error %")
 RMS_ERROR = _column("rms_error_percent", "rms error", "%", "rms %")
-MINOR_HIGH = _column("minor_high_percent", "hysteresis of upper minor loop", "%", "upper %")
-MINOR_LOW = _column("minor_low_percent", "hysteresis of lower minor loop", "%", "lower %")
 NATURAL = _column("natural_hz", "natural frequency", "Hz", "reson. Hz")
 DAMPING = _column("damping_ratio", "damping ratio", "", "damping")
 MODEL_ERROR = RunFigure(
@@ -151,136 +149,3 @@ def _trend(
     whole = float(np.sum((y - y.mean()) ** 2))
     left = float(np.sum((y - slope * x - offset) ** 2))
     return Trend(figure, along, held, x, y, slope, offset, 1.0 - left / whole if whole else None)
-
-
-def extremes(
-    figure: RunFigure, runs: Sequence[SeriesRun]
-) -> tuple[tuple[SeriesRun, float], tuple[SeriesRun, float]] | None:
-    """Return the runs with the lowest and the highest value of a metric; None without any."""
-    found = figure.of(runs)
-    if not found:
-        return None
-    return min(found, key=lambda each: each[1]), max(found, key=lambda each: each[1])
-
-
-_MOST_FAILED = 3
-_LINEAR = 0.95  # least r2 of a linear trend
-
-
-def headline(series: RunSeries) -> list[str]:
-    """Return sentences on the number of runs, best and worst results, trends and drift."""
-    drift = str(series.drift) if series.drift else ""
-    sentences = [_counted(series), *_results(series), *_trends(series)]
-    return [*sentences, f"{drift[0].upper()}{drift[1:]}."] if drift else sentences
-
-
-def _counted(series: RunSeries) -> str:
-    whole = len(series.runs)
-    done = sum(run.completed for run in series.runs)
-    if not series.failed and not series.planned:
-        return f"{_runs(whole)}, all completed." if whole > 1 else f"{_runs(whole)}, completed."
-    parts = [f"{done} of {_runs(whole)} completed"]
-    if series.failed:
-        shown = [f"{series.text(run)} ({run.result})" for run in series.failed[:_MOST_FAILED]]
-        left_out = len(series.failed) - len(shown)
-        more = f" and {left_out} more" if left_out else ""
-        parts.append(f"{len(series.failed)} failed: {'; '.join(shown)}{more}")
-    if series.planned:
-        parts.append(f"{series.planned} remaining")
-    return f"{', '.join(parts)}."
-
-
-def _runs(count: int) -> str:
-    return f"{count} run{'' if count == 1 else 's'}"
-
-
-def _results(series: RunSeries) -> Iterator[str]:
-    if NATURAL.of(series.done):
-        yield _between(series, NATURAL, series.done)
-        yield _between(series, DAMPING, series.done)
-        return
-    compensator = next((each for each in series.dimensions if each.is_compensator), None)
-    if compensator is not None:
-        yield from _compensators(series, compensator)
-        return
-    for figure in (PEAK_ERROR, HYSTERESIS):
-        if figure.of(series.done):
-            yield _between(series, figure, series.done)
-    if not HYSTERESIS.of(series.done) and STROKE.of(series.done):
-        yield _between(series, STROKE, series.done)
-
-
-def _between(series: RunSeries, figure: RunFigure, runs: Sequence[SeriesRun]) -> str:
-    found = extremes(figure, runs)
-    if found is None:
-        return f"No run has a {figure.text}."
-    (best, low), (worst, high) = found
-    name = figure.text[0].upper() + figure.text[1:]
-    if best is worst:
-        return f"{name} {quantity(low, figure.unit)}."
-    low_text, high_text = (quantity(value, figure.unit) for value in (low, high))
-    return f"{name} {low_text} ({series.text(best)}) to {high_text} ({series.text(worst)})."
-
-
-def _compensators(series: RunSeries, compensator: VariedParameter) -> Iterator[str]:
-    """Yield peak hysteresis without and with compensators, and where each is worst."""
-    parts = []
-    for value in compensator.values:
-        runs = [run for run in series.done if run.values.get(compensator.key) == value]
-        found = extremes(HYSTERESIS, runs)
-        if found is None:
-            continue
-        (_, low), (worst, high) = found
-        others = texts_of(
-            (each for each in series.dimensions if each is not compensator), worst.values
-        )
-        name = "without compensator" if value == "none" else f"with {value}"
-        at = f", worst at {others}" if others and len(runs) > 1 else ""
-        between = f"{significant(low)} to " if significant(low) != significant(high) else ""
-        parts.append(f"{name} {between}{quantity(high, '%')}{at}")
-    if parts:
-        yield f"Peak hysteresis {'; '.join(parts)}."
-
-
-def _trends(series: RunSeries) -> Iterator[str]:
-    for along in series.dimensions:
-        if not along.numeric:
-            continue
-        said = defaultdict(list)
-        for figure in (STROKE, HYSTERESIS, NATURAL):
-            found = [each for each in trends(series, figure, along) if _uncompensated(series, each)]
-            directions = {each.direction for each in found}
-            if len(directions) == 1 and (direction := directions.pop()):
-                said[direction].append(figure.text)
-        parts = [f"{' and '.join(names)} {_verb(names, how)}" for how, names in said.items()]
-        if parts:
-            yield f"With {along.name}, {'; '.join(parts)}."
-        if along.is_frequency:
-            yield from _linear(series, along)
-
-
-def _verb(names: Sequence[str], direction: str) -> str:
-    if len(names) == 1:
-        return direction
-    return {"rises": "rise", "falls": "fall", "does not change": "do not change"}[direction]
-
-
-def _uncompensated(series: RunSeries, trend: Trend) -> bool:
-    """Return whether a trend is of runs without a compensator."""
-    return not any(
-        run.digest is not None and run.digest.compensated
-        for run in series.done
-        if all(run.values.get(key) == value for key, value in trend.held.items())
-    )
-
-
-def _linear(series: RunSeries, along: VariedParameter) -> Iterator[str]:
-    found = [
-        each.r2
-        for each in trends(series, AREA, along)
-        if each.r2 is not None and _uncompensated(series, each)
-    ]
-    if found and min(found) >= _LINEAR:
-        low, high = f"{min(found):.4f}", f"{max(found):.4f}"
-        between = low if low == high else f"{low} to {high}"
-        yield f"The loop area is linear in {along.name} (r² {between})."

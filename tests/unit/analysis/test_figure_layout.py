@@ -36,7 +36,6 @@ def test_a_figure_has_the_width_of_a_column_and_letters_of_one_size(width):
     [
         (3, {}, "single", 1), (3, {}, "double", 3), (4, {}, "double", 2),
         (6, {"alike": True}, "single", 2), (2, {"stacked": True}, "double", 1),
-        (2, {"most_beside": 1}, "double", 1),
     ],
 )  # fmt: skip
 def test_panels_are_side_by_side_if_there_is_room(count, keys, width, columns):

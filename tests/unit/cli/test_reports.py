@@ -77,10 +77,10 @@ def test_wrong_options_are_refused(hilctl, words, option):
 
 def test_several_runs_are_one_object_or_a_table(hilctl, json_of):
     _, found = json_of("report", RUN, RUN)
-    assert found["headline"].startswith("2 runs, all completed.")
+    assert found["headline"].startswith("2 of 2 runs")
     assert [run["recording"] for run in found["runs"]] == [RUN.name] * 2
     _, shown, _ = hilctl("report", RUN, RUN)
-    assert shown.startswith("2 runs, all completed.")
+    assert shown.startswith("2 of 2 runs")
     assert "2: terfenol_uncompensated.mcap" in shown
 
 
@@ -88,8 +88,8 @@ def test_folder_is_one_page(tmp_path, monkeypatch, hilctl):
     monkeypatch.setattr(html, "drawn", lambda sheet: None)
     monkeypatch.setattr(html, "svg", lambda figure, text: f'<svg aria-label="{text}"></svg>')
     words = ("report", GOLDEN, "--html", tmp_path / "page.html")
-    assert "all completed" in hilctl(*words)[1]
-    assert "runs, all completed" in (tmp_path / "page.html").read_text(encoding="utf-8")
+    assert "3 of 3 runs" in hilctl(*words)[1]
+    assert "3 of 3 runs completed" in (tmp_path / "page.html").read_text(encoding="utf-8")
     assert hilctl(*words)[0] == 2
 
 
@@ -109,7 +109,7 @@ def test_unreadable_runs_are_listed_without_control_characters(capsys):
     missing = ("lost.mcap: \x1b[2J[bold]no such file",)
     print_rich(render_series(RunSeries("[red]two", runs, ("waveform.frequency_hz",), missing)))
     shown = capsys.readouterr().out
-    assert shown.startswith("2 runs")
+    assert shown.startswith("2 of 2 runs")
     assert "[red]two" in shown
     assert "lost.mcap: \\x1b[2J[bold]no such file" in shown
     assert "\x1b[2J" not in shown

@@ -39,6 +39,25 @@ def test_what_a_campaign_writes_reads_back_the_same(rows, tmp_path):
     assert find_table(tmp_path) == path
 
 
+def test_metrics_that_are_no_longer_computed_were_not_varied(rows, tmp_path):
+    columns = columns_of(tuple(POINT), rows)
+    more = {"offset_um": {"offset_um": [None, None], "minor_low_um": [None, 3.0]}}
+    before = {}
+    for name, values in columns.items():
+        before |= more.get(name, {name: values})
+    path = tmp_path / "few.csv"
+    path.write_text(csv_text(before), encoding="utf-8")
+    assert read_entries(path)[1].values.keys() == POINT.keys()
+
+
+def test_failed_and_remaining_runs_are_counted(crossed):
+    broken = replace(crossed.runs[2], result="fault: the coil is hot")
+    later = replace(crossed.runs[5], result="planned")
+    series = replace(crossed, runs=(*crossed.runs[:2], broken, *crossed.runs[3:5], later))
+    assert series.headline.startswith("4 of 6 runs")
+    assert "1 failed: 200 Hz, 3 A (fault: the coil is hot), 1 remaining" in series.headline
+
+
 def test_other_tables_are_none(rows, tmp_path):
     (tmp_path / "notes.csv").write_text("a,b\n1,2\n")
     (tmp_path / "bytes.csv").write_bytes(b"\xff\xfe")

@@ -48,7 +48,6 @@ def test_a_sine_straight_to_the_coil(figures):
     assert found.loop_area == pytest.approx(np.pi * 10.0 * np.sin(0.1), rel=1e-3)
     assert (found.deadline_misses, found.heat_before_a, found.heat_after_a) == (3, 2.0, 3.0)
     assert found.peak_error_percent is None
-    assert found.minor_low_um is None
     assert found.natural_hz is None
 
 
@@ -60,13 +59,6 @@ def test_a_compensated_run_has_errors_and_its_offset(figures):
     assert found.rms_error_percent == pytest.approx(1.0, rel=1e-3)
     assert found.offset_um == 0.7
     assert found.heat_after_a is None
-
-
-def test_minor_loops_at_either_end(figures):
-    command = 4.0 * np.sin(2 * np.pi * 100.0 * TIME) + 3.0 * np.sin(2 * np.pi * 300.0 * TIME)
-    waveform = "{kind: complex_harmonic, components: [{amplitude: 1, frequency_hz: 1}]}"
-    found = figures(command + 0.05 * command**2, waveform, command=command)
-    assert found.minor_high_um > 1.2 * found.minor_low_um > 1.0
 
 
 def test_a_step_s_ringing(figures):

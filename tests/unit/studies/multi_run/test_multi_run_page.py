@@ -20,8 +20,8 @@ pytestmark = pytest.mark.usefixtures("undrawn")
 def test_what_came_out_stands_first(crossed, tmp_path):
     write_series(crossed, tmp_path / "loops.html")
     page = (tmp_path / "loops.html").read_text(encoding="utf-8")
-    assert page.index("6 runs") < page.index("<svg ")
-    assert page.count("<figure") == 5
+    assert page.index("6 of 6 runs") < page.index("<svg ")
+    assert page.count("<figure") == 4
     assert "Linear fits" in page
     assert "1.0000" in page
 

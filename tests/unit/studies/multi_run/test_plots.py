@@ -1,4 +1,4 @@
-"""Selection and files of figures; trends, sensitivity and order."""
+"""Selection and files of figures; trends."""
 
 from dataclasses import replace
 
@@ -37,43 +37,10 @@ def test_what_compensators_leave_is_a_figure_of_its_own(compensated):
     assert error[0].get_color() == lines[1].get_color()
 
 
-def test_sensitivity_is_the_change_over_the_range(crossed):
-    sheet = plots.sensitivity_sheet(crossed)
-    axes = drawn(sheet.panels[0])
-    sizes = {
-        label.get_text().split("\n")[0]: bar.get_width()
-        for label, bar in zip(axes.get_yticklabels(), axes.patches, strict=True)
-    }
-    assert sizes["amplitude"] == pytest.approx(100.0 * 30.0 / 45.0)
-    assert sizes["frequency"] == pytest.approx(0.0)
-    one = RunSeries("one", crossed.runs[:3], crossed.keys)
-    assert plots.sensitivity_sheet(one) is None
-
-
-def test_reference_runs_are_marked_in_order(crossed):
-    assert plots.order_sheet(crossed) is None
-    runs = [replace(run, is_reference=run.number in {1, 6}) for run in crossed.runs]
-    sheet = plots.order_sheet(replace(crossed, runs=tuple(runs)))
-    axes = drawn(sheet.panels[0])
-    assert [line.get_label() for line in axes.lines[:2]] == ["runs", "reference runs"]
-    assert axes.lines[1].get_xdata().tolist() == [1, 6]
-
-
-def test_resonances_against_what_varied(crossed):
-    assert plots.resonance_sheet(crossed) is None
-    runs = [
-        replace(run, figures=replace(run.figures, natural_hz=2300.0, damping_ratio=0.12))
-        for run in crossed.runs
-    ]
-    sheet = plots.resonance_sheet(replace(crossed, runs=tuple(runs)))
-    labels = [drawn(panel).get_ylabel() for panel in sheet.panels]
-    assert labels == ["natural frequency, Hz", "damping ratio"]
-
-
 def test_they_are_found_from_what_varied(crossed, compensated):
     for series, names in (
         (crossed, "hysteresis_against_frequency hysteresis_against_amplitude loops_by_frequency "
-                  "loops_by_amplitude sensitivity"),
+                  "loops_by_amplitude"),
         (compensated, "before_and_after hysteresis_against_frequency "
                       "compensation_against_frequency loops_by_frequency "
                           "loops_by_frequency_against_reference error_history"),

@@ -1,7 +1,5 @@
 """Figures of runs side by side."""
 
-from dataclasses import replace
-
 import numpy as np
 import pytest
 from matplotlib.colors import to_rgb
@@ -13,7 +11,6 @@ from hilctl.studies.multi_run.run_plots import (
     error_sheet,
     looks,
     loop_sheets,
-    minor_loop_sheet,
     model_sheet,
     spread,
 )
@@ -92,7 +89,7 @@ def test_before_and_after_of_the_same_settings(compensated):
 
 
 def test_runs_of_one_kind_have_no_before_and_after(crossed):
-    for sheet in (before_after_sheet, error_sheet, model_sheet, minor_loop_sheet):
+    for sheet in (before_after_sheet, error_sheet, model_sheet):
         assert sheet(crossed) is None
 
 
@@ -107,15 +104,6 @@ def test_errors_of_compensated_runs(compensated):
 def test_a_run_alone_shows_its_error(compensated):
     alone = RunSeries("one", compensated.runs[2:3], ())
     assert len(error_sheet(alone).panels) == 1
-
-
-def test_minor_loops_are_marked_within_the_cycle():
-    phase = np.linspace(0.0, 2.0 * np.pi, 400)
-    wave = 4.0 * np.sin(phase) + 3.0 * np.sin(3.0 * phase)
-    run = grown(4.0, 20.0, digest=digest(loop=np.array((wave, 5.0 * wave))))
-    run = replace(run, figures=replace(run.figures, minor_low_um=26.0))
-    sheet = minor_loop_sheet(RunSeries("minor", (run,), tuple(run.values)))
-    assert labels(drawn(sheet.panels[0])) == ["cycle", "minor loop", "minor loop"]
 
 
 def test_the_model_s_error_stands_beside_its_loop():
