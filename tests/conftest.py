@@ -21,6 +21,7 @@ from hilctl.kernels.jit import ensure_compiled
 from hilctl.run.processes import signal_guardian
 from hilctl.run.run_folder import runs
 from hilctl_drivers import profile
+from tests.rigs import DEVICES
 
 ROOT = Path(__file__).parents[1]
 HARDWARE = Path(__file__).parent / "hardware"
@@ -125,6 +126,13 @@ def caplog():
     logging.getLogger().addHandler(handler)
     yield handler
     logging.getLogger().removeHandler(handler)
+
+
+@pytest.fixture
+def other_rigs(monkeypatch):
+    """Make the rigs of other physics known to the experiments of a test."""
+    for name, place in DEVICES.items():
+        monkeypatch.setitem(registry.BUILTIN, name, place)
 
 
 @pytest.fixture(scope="session", autouse=True)

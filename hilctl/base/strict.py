@@ -1,7 +1,7 @@
 """Base of all pydantic models, the pydantic names that models use, and the words of its errors."""
 
-from collections.abc import Iterable
-from typing import Self
+from collections.abc import Iterable, Mapping
+from typing import ClassVar, Self
 
 from pydantic import (
     AfterValidator,
@@ -77,6 +77,9 @@ def first_problem(error: ValidationError, whole: str = "message") -> str:
 
 class StrictModel(BaseModel):
     """A frozen model that rejects unknown keys, other types, NaN and infinity."""
+
+    REMOVED: ClassVar[Mapping[str, str]] = {}
+    """Keys of earlier releases, each with what to do."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 

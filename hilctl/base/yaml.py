@@ -110,7 +110,8 @@ def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> Conf
     if first.detail["type"] == "value_error":  # a rule on several keys begins with the key
         place = (*loc, *loc_of(rule.split(" ", 1)[0]))
     known = first.kinds or (first.parent.model_fields if first.parent else ())
-    hint = next(filter(None, (_hint(each.detail, known) for each in group)), "")
+    removed = getattr(first.parent, "REMOVED", {}).get(loc[-1] if loc else "")
+    hint = removed or next(filter(None, (_hint(each.detail, known) for each in group)), "")
     return ConfigProblem(where(place), dotted(loc), rule, _value(first.detail), hint)
 
 

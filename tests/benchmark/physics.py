@@ -30,16 +30,24 @@ from hilctl.models.base import HysteresisModel, stroke_class
 from hilctl.models.model_file import load_model
 from hilctl.signals.cycle_metrics import expected_maximum
 from hilctl_drivers.simulated.actuator_base import Plant
-from hilctl_drivers.simulated.devices import PHYSICS, SimulatedDevice
+from hilctl_drivers.simulated.devices import SimulatedDevice
 from tests.benchmark.references import GOALS, RATE_HZ, Row, Stroke, references
+from tests.rigs import register
+
+register()
 
 CONFIGS = Path(__file__).parents[2] / "configs"
-RIGS = {physics: ("terfenol_sine_6a.yaml", f"device.physics={physics}") for physics in PHYSICS} | {
+RIGS: dict[str, tuple[str, ...]] = {
+    "pinned_cells": ("terfenol_sine_6a.yaml",),
+    **{
+        name: ("terfenol_sine_6a.yaml", f"device.kind=simulated_{name}")
+        for name in ("domains", "diffusion", "jiles_atherton", "growing_lag")
+    },
     "thermal_switching": (
         "piezo_sine.yaml",
-        "device.physics=thermal_switching",
+        "device.kind=simulated_thermal_switching",
         "limits.slew_v_per_s=200000",
-    )
+    ),
 }
 """Experiment file and settings of each rig."""
 MARGIN = 0.06  # of the range that a model was identified on, at either end

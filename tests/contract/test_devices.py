@@ -27,8 +27,6 @@ TIMEOUT_S = 5.0
 ELSEWHERE = {"serial_dac": "test_serial_devices.py", "modbus_stream": "test_modbus_stream.py"}
 """Devices that are tested with this contract in another file."""
 SIMULATED = sorted(set(BUILTIN) - {"modbus_dac", *ELSEWHERE})
-PHYSICS = ("domains", "diffusion", "jiles_atherton", "growing_lag")
-"""What simulated_terfenol is tried with beside its default."""
 MODBUS = (
     "adam_6024", "beckhoff_bk9000", "generic_float32", "icp_et7000", "labjack_t4", "labjack_t7",
     "labjack_t8", "wago_750", "rtu",
@@ -44,9 +42,9 @@ PIEZO = ("generic_float32 V", "labjack_t8 V")
 """Modbus profiles that drive a piezo too: with both signs, and from 0 V."""
 
 
-def simulated(kind, words):
+def simulated(kind):
     chosen = device_class(kind)
-    device = chosen(chosen.Options(physics=words[0]) if words else chosen.Options())
+    device = chosen(chosen.Options())
     return DrivenDevice(
         device, SAMPLES, RATE_HZ, lambda: device._last_command, name=kind, starts_at_rest=True
     )
@@ -106,8 +104,6 @@ def _fast(section):
 CASES = [
     *SIMULATED,
     *OTHERS,
-    *(f"simulated_terfenol {words}" for words in PHYSICS),
-    "simulated_piezo thermal_switching",
     *(f"modbus_dac {words}" for words in (*MODBUS, *PIEZO)),
 ]
 
@@ -126,7 +122,7 @@ def make():
             elif kind in OTHERS:
                 driven = of_another_package(kind)
             else:
-                driven = simulated(kind, words)
+                driven = simulated(kind)
             stack.callback(driven.device.close)
             return driven
 

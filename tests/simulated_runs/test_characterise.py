@@ -34,9 +34,9 @@ def characterised(path, settings, folder, output):
     pytest.param("diffusion", 2.5, marks=pytest.mark.long),
     pytest.param("jiles_atherton", 8.0, marks=pytest.mark.long),
 ])  # fmt: skip
-def test_a_rig_of_any_physics_gets_a_model(tmp_path, physics, within_percent):
+def test_a_rig_of_any_physics_gets_a_model(tmp_path, other_rigs, physics, within_percent):
     model = tmp_path / "model.yaml"
-    other = [] if physics == "terfenol" else [f"device.physics={physics}"]
+    other = [f"device.kind=simulated_{physics}"]
     found = characterised(RIG, other, tmp_path / "runs", model)
     assert found.problem == ""
     assert found.held_out[0].peak_percent < within_percent

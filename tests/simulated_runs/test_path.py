@@ -19,9 +19,9 @@ MORE_RIGS = {
     "current, both signs": ("simulated_terfenol", (), 1.2),
     "current, one sign": ("simulated_terfenol", ("limits.drive_a=[0.0, 6.0]",), 1.2),
     "voltage, both signs": ("simulated_piezo", (STAGE,), 0.24),
-    "domains": ("simulated_terfenol", ("device.physics=domains",), 1.2),
-    "diffusion": ("simulated_terfenol", ("device.physics=diffusion",), 1.2),
-    "jiles_atherton": ("simulated_terfenol", ("device.physics=jiles_atherton",), 1.2),
+    "domains": ("simulated_domains", (), 1.2),
+    "diffusion": ("simulated_diffusion", (), 1.2),
+    "jiles_atherton": ("simulated_jiles_atherton", (), 1.2),
 }
 
 
@@ -58,7 +58,7 @@ def test_a_simulated_rig_is_compensated_by_default(tmp_path, device, settings, p
 
 @pytest.mark.long
 @pytest.mark.parametrize(("device", "settings", "percent"), MORE_RIGS.values(), ids=MORE_RIGS)
-def test_so_are_the_others(tmp_path, device, settings, percent):
+def test_so_are_the_others(tmp_path, other_rigs, device, settings, percent):
     follow(tmp_path, device, (*settings, *QUICK), percent)
 
 

@@ -208,7 +208,7 @@ def emulate(
         list[str] | None,
         typer.Option(
             metavar="KEY=VALUE",
-            help="Option of the simulated actuator, such as physics=domains; may be repeated.",
+            help="Option of the simulated actuator, such as load_kg=2; may be repeated.",
         ),
     ] = None,
     command: Annotated[

@@ -277,7 +277,7 @@ def _rig(
             strain = _RANGE_SHARE * range_um / _stroke_um(actuator, max(limits, key=abs))
             rated["vary"] = {"strain": min(1.0, strain)}
             actuator = TerfenolOptions.model_validate(rated)
-    if isinstance(actuator, PiezoOptions) and (actuator.physics, actuator.stage) == ("plays", None):
+    if isinstance(actuator, PiezoOptions) and actuator.stage is None:
         if wiring is None:  # 0 V of an output drives with 0 V
             share = min(0.0, output.min) / max(abs(output.min), abs(output.max))
             drive_v: Sequence[float] = (share * _DRIVE_V, _DRIVE_V)

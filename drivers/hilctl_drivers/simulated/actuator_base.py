@@ -107,11 +107,6 @@ class Plant(ABC):
         """Do :meth:`step` for one chunk with its noise; all arrays are contiguous."""
 
 
-ROD_LENGTH_M = 0.1206  # two rods of 60.3 mm, section 3.3.1 (chapter 2) of the dissertation
-ROD_RADIUS_M = 6.15e-3
-VACUUM_PERMEABILITY = 1.25663706212e-6
-
-
 @dataclass(frozen=True, slots=True)
 class Coil:
     """The field at the surface, ``factor_per_m * current + bias_a_per_m``, in steps."""

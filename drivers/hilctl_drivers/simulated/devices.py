@@ -7,7 +7,7 @@ buffered.
 
 import math
 from abc import abstractmethod
-from collections.abc import Sequence
+from collections.abc import Mapping, Sequence
 from dataclasses import asdict, replace
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
@@ -19,9 +19,6 @@ from hilctl.base.strict import Field, StrictModel, ValidationInfo, field_validat
 from hilctl.base.types import F64
 from hilctl_drivers.device import CalibrationName, DacDevice, details_of
 from hilctl_drivers.simulated.actuator_base import Plant, RodParameters
-from hilctl_drivers.simulated.diffusion import DiffusionParameters
-from hilctl_drivers.simulated.domains import DomainsParameters
-from hilctl_drivers.simulated.jiles_atherton import GrowingLagParameters, JilesAthertonParameters
 from hilctl_drivers.simulated.piezo import PiezoActuator, PiezoParameters
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.terfenol import (
@@ -31,7 +28,6 @@ from hilctl_drivers.simulated.terfenol import (
     TerfenolParameters,
     Thermal,
 )
-from hilctl_drivers.simulated.thermal_switching import SwitchingActuator, SwitchingParameters
 
 FIFO_DEPTH = 4096
 MAX_RATE_HZ = 200e3
@@ -95,7 +91,7 @@ class SimulatedDevice(DacDevice):
     def __init__(
         self,
         options: SimulatedOptions,
-        parameters: TerfenolParameters | PiezoParameters | SwitchingParameters,
+        parameters: TerfenolParameters | PiezoParameters,
         **info: Any,
     ) -> None:
         """Describe the device; a recording keeps parameters and options as its details."""
@@ -212,16 +208,6 @@ class SimulatedDevice(DacDevice):
             np.minimum(spoilt, self._reach_um, out=spoilt)
 
 
-Physics: TypeAlias = Literal[
-    "pinned_cells", "domains", "diffusion", "jiles_atherton", "growing_lag"
-]
-PHYSICS: dict[Physics, type[RodParameters]] = {
-    "pinned_cells": PinnedCellsParameters,
-    "domains": DomainsParameters,
-    "diffusion": DiffusionParameters,
-    "jiles_atherton": JilesAthertonParameters,
-    "growing_lag": GrowingLagParameters,
-}
 Factor: TypeAlias = Annotated[float, Field(ge=0.5, le=2.0)]
 
 
@@ -289,14 +275,9 @@ _TEMPERATURES = (
 class TerfenolOptions(SimulatedOptions):
     """Options of ``simulated_terfenol``."""
 
-    physics: Physics = Field(
-        default="pinned_cells",
-        description="physics of the rods; pinned_cells: cells with dry friction behind one lag"
-        " of the field; domains: domains of eight orientations, averaged over their energies;"
-        " diffusion: the field diffuses into conducting rods, shell by shell;"
-        " jiles_atherton: Jiles and Atherton's equations with eddy and excess loss;"
-        " growing_lag: the same with an eddy-current loss that grows with itself",
-    )
+    REMOVED: ClassVar[Mapping[str, str]] = {"physics": "removed, there is one; delete the key"}
+    RODS: ClassVar[type[RodParameters]] = PinnedCellsParameters
+
     load_kg: float = Field(default=0.0, ge=0.0, le=100.0, description="mass on the actuator, kg")
     magnet: bool = Field(
         default=True,
@@ -382,7 +363,7 @@ class TerfenolOptions(SimulatedOptions):
             sensor_noise_um=rated.sensor_noise_um if self.noise else 0.0,
             drift_um=drift.um,
             drift_s=drift.tau_s,
-            rods=PHYSICS[self.physics](),
+            rods=self.RODS(),
             creep=self.creep,
             thermal=self.thermal,
             second_mode=self.second_mode,
@@ -432,23 +413,13 @@ class PiezoStage(DeviceOptions):
 class PiezoOptions(SimulatedOptions):
     """Options of ``simulated_piezo``."""
 
-    physics: Literal["plays", "thermal_switching"] = Field(
-        default="plays",
-        description="plays: the published stage, or that of stage; thermal_switching: domains that"
-        " switch over barriers by thermal activation, in a stack with two modes",
-    )
+    REMOVED: ClassVar[Mapping[str, str]] = {"physics": "removed, there is one; delete the key"}
     stage: PiezoStage | None = Field(
         default=None, description="a stage of your own instead of the published P-753.31C"
     )
     sensor_noise_um: float = Field(
         default=1e-3, ge=0.0, le=1.0, description="rms noise of each reading, um"
     )
-
-    @model_validator(mode="after")
-    def _stage_of_plays(self) -> Self:
-        if self.stage is not None and self.physics != "plays":
-            raise ValueError(f"stage is for physics: plays (got {self.physics}): remove it")
-        return self
 
 
 class SimulatedTerfenol(SimulatedDevice):
@@ -505,11 +476,7 @@ class SimulatedPiezo(SimulatedDevice):
         self._seed = options.seed
         noise_um = options.sensor_noise_um if options.noise else 0.0
         stage = options.stage.model_dump() if options.stage else {}
-        self._parameters: PiezoParameters | SwitchingParameters
-        if options.physics == "plays":
-            self._parameters = PiezoParameters(sensor_noise_um=noise_um, **stage)
-        else:
-            self._parameters = SwitchingParameters(sensor_noise_um=noise_um)
+        self._parameters = PiezoParameters(sensor_noise_um=noise_um, **stage)
         low_v, high_v = self._parameters.drive_min_v, self._parameters.drive_max_v
         drive = f"{low_v:g}..{high_v:g} V drive"
         super().__init__(
@@ -525,7 +492,4 @@ class SimulatedPiezo(SimulatedDevice):
 
     def plant(self, sample_rate_hz: float) -> Plant:
         """Return the stage at rest."""
-        parameters = self._parameters
-        if isinstance(parameters, PiezoParameters):
-            return PiezoActuator(parameters, sample_rate_hz, self._seed)
-        return SwitchingActuator(parameters, sample_rate_hz, self._seed)
+        return PiezoActuator(self._parameters, sample_rate_hz, self._seed)

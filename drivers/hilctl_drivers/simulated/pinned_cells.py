@@ -1,4 +1,4 @@
-"""Rod model with pinned cells behind a lag of the field; the default.
+"""Rod model with pinned cells behind a lag of the field.
 
 The pinned cells follow A. Bergqvist, "Magnetic vector hysteresis model with dry friction-like
 pinning", Physica B 233 (1997) 342, and F. Henrotte et al., "An energy-based vector hysteresis model

@@ -2,9 +2,9 @@
 
 Amplifier, rods, structure and sensor are chained as in the rig of the dissertation "Modeling and
 Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of Magnetostrictive Actuators",
-Concordia, sections 3.3 and 3.4 of its chapter 2. The rods have one of several physics (``Rods``).
-The first is near to what a compensator inverts: pinned magnetisation after a non-linear lag of the
-field, where that has plays of the current. The others have nothing of it.
+Concordia, sections 3.3 and 3.4 of its chapter 2. The physics of the rods (``Rods``) is near to what
+a compensator inverts: pinned magnetisation after a non-linear lag of the field, where that has
+plays of the current.
 """
 
 import math

@@ -1,7 +1,7 @@
 """Documents: values with their places, settings from the command line, problems in words."""
 
 from collections.abc import Mapping
-from typing import Annotated, Literal
+from typing import Annotated, ClassVar, Literal
 
 import pytest
 from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validator, model_validator
@@ -452,6 +452,8 @@ def test_keys_and_suggestions() -> None:
 
 
 class Wave(StrictModel):
+    REMOVED: ClassVar = {"heights_um": "removed: set height_um"}
+
     unit: Literal["um", "A"] = "um"
     height_um: float = 0.0
     cycles: int = 1
@@ -484,6 +486,7 @@ def read(text, **more):
     ("cycles: 1e300", "must be a whole number"),
     ("unit: µm", "must be one of 'um' or 'A', got 'µm'"),
     ("height_µm: 2.0", r"unknown key \(did you mean 'height_um'\?\)"),
+    ("heights_um: 2.0", r"heights_um: unknown key \(removed: set height_um\)"),
 ])  # fmt: skip
 def test_what_can_not_be_decided_is_refused(text, said):
     with pytest.raises(ConfigError, match=said):

@@ -141,7 +141,7 @@ def test_an_experiment_in_volts_has_a_piezo(ended_at_once, tmp_path):
 @pytest.mark.parametrize(
     ("words", "key"),
     [
-        (["--actuator", "physics=domains"], "physics"),
+        (["--actuator", "physics=plays"], "delete the key"),
         (["--actuator", "fault.kind=refused", "--actuator", "output_at_open=1"], "output_at_open"),
         (["--actuator", "seed"], "--actuator seed"),
         (["--unit", "V"], "--unit"),

@@ -8,11 +8,12 @@ import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from hilctl_drivers.simulated.actuator_base import CHUNK, VACUUM_PERMEABILITY, Coil, SensorNoise
-from hilctl_drivers.simulated.devices import PHYSICS
-from hilctl_drivers.simulated.domains import DomainsParameters
-from hilctl_drivers.simulated.jiles_atherton import JilesAthertonParameters
+from hilctl_drivers.simulated.actuator_base import CHUNK, Coil, SensorNoise
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
+from tests.rigs import VACUUM_PERMEABILITY
+from tests.rigs.devices import RODS
+from tests.rigs.domains import DomainsParameters
+from tests.rigs.jiles_atherton import JilesAthertonParameters
 
 RATED = TerfenolParameters()
 RATE_HZ = 50e3
@@ -56,12 +57,12 @@ class TestBlocks:
         np.testing.assert_array_equal(run(held, self.COMMAND_A), run(sent, self.COMMAND_A))
 
 
-rigs = pytest.mark.parametrize("physics", PHYSICS)
+rigs = pytest.mark.parametrize("physics", RODS)
 
 
 def parameters(physics, **vary):
     factors = {"lag": 1.0, "pinning": 1.0, "strain": 1.0} | vary
-    rods = PHYSICS[physics]().varied(**factors)
+    rods = RODS[physics]().varied(**factors)
     return TerfenolParameters(sensor_noise_um=0.0, rods=rods)
 
 
@@ -190,7 +191,7 @@ class TestVaried:
 @rigs
 def test_rods_rest_where_the_bias_has_been_for_long(physics):
     """Without a change of the current nothing moves, not in ten thousand steps."""
-    rods = PHYSICS[physics]().rods(Coil(5.09e3, 44.1e3, 1e-5))
+    rods = RODS[physics]().rods(Coil(5.09e3, 44.1e3, 1e-5))
     rest_um, free_um = rods.rest(), np.empty(10_000)
     rods.follow(np.zeros(20_001), free_um)
     np.testing.assert_allclose(free_um, rest_um, rtol=0.0, atol=1e-9)

@@ -15,8 +15,9 @@ from scipy.signal import StateSpace, lsim
 
 from hilctl.base.device import VoltageLimit
 from hilctl_drivers.simulated import terfenol
-from hilctl_drivers.simulated.devices import PHYSICS, SimulatedTerfenol, TerfenolOptions
+from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
+from tests.rigs.devices import OTHER_RODS
 from tests.unit.drivers.simulated.test_actuator_base import hysteresis_percent, run
 
 RATED = terfenol.TerfenolParameters()
@@ -178,8 +179,8 @@ def options(**given):
     return TerfenolOptions.model_validate({"noise": False, **given})
 
 
-def actuator(rate_hz=RATE_HZ, **given):
-    of = options(**given)
+def actuator(rate_hz=RATE_HZ, chosen=TerfenolOptions, **given):
+    of = chosen.model_validate({"noise": False, **given})
     return terfenol.TerfenolActuator(of.parameters(), rate_hz, of.load_kg, of.bias_a)
 
 
@@ -189,12 +190,12 @@ def run_both(rig, command_a):
     return displacement_um, current_a
 
 
-@pytest.mark.parametrize("physics", PHYSICS)
-def test_cut_does_not_matter(physics):
+@pytest.mark.parametrize("chosen", [TerfenolOptions, *OTHER_RODS])
+def test_cut_does_not_matter(chosen):
     """With everything at once, readings are the same bit for bit wherever blocks are cut."""
     command_a = np.random.default_rng(7).uniform(-7.0, 7.0, 60).repeat(50)
-    whole = run_both(actuator(physics=physics, **EVERYTHING), command_a)[0]
-    rig = actuator(physics=physics, **EVERYTHING)
+    whole = run_both(actuator(chosen=chosen, **EVERYTHING), command_a)[0]
+    rig = actuator(chosen=chosen, **EVERYTHING)
     cut = [run_both(rig, part)[0] for part in np.split(command_a, [1, 2, 50, 777, 2990])]
     np.testing.assert_array_equal(np.concatenate(cut), whole)
     rig.reset()
@@ -203,11 +204,9 @@ def test_cut_does_not_matter(physics):
 
 def test_details_hold_what_was_asked_for():
     """A recording says what rig it was."""
-    details = SimulatedTerfenol(options(physics="diffusion", **EVERYTHING)).info.details
-    assert details["physics"] == "diffusion"
+    details = SimulatedTerfenol(options(**EVERYTHING)).info.details
     assert "voltage_max_v" in json.loads(details["amplifier"])
-    assert details["knee_a_per_m"] == "27000.0"
-    assert "lag_s" not in details
+    assert float(details["lag_s"]) == PinnedCellsParameters().lag_s
     assert SimulatedTerfenol(TerfenolOptions()).info.details["creep"] == "null"
 
 

@@ -9,7 +9,7 @@ from scipy.integrate import solve_ivp
 from scipy.optimize import brentq
 
 from hilctl_drivers.simulated.actuator_base import Coil
-from hilctl_drivers.simulated.jiles_atherton import (
+from tests.rigs.jiles_atherton import (
     GrowingLagParameters,
     JilesAthertonParameters,
     langevin,

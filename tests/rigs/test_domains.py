@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 from scipy.optimize import minimize
 
-from hilctl_drivers.simulated import domains
-from hilctl_drivers.simulated.actuator_base import ROD_LENGTH_M, VACUUM_PERMEABILITY, Coil
+from hilctl_drivers.simulated.actuator_base import Coil
+from tests.rigs import ROD_LENGTH_M, VACUUM_PERMEABILITY, domains
 
 RATED = domains.DomainsParameters()
 STEP_S = 1e-5

@@ -26,13 +26,11 @@ import numpy as np
 from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
 from hilctl_drivers.simulated.actuator_base import (
-    ROD_LENGTH_M,
-    ROD_RADIUS_M,
-    VACUUM_PERMEABILITY,
     Coil,
     RodParameters,
     Rods,
 )
+from tests.rigs import ROD_LENGTH_M, ROD_RADIUS_M, VACUUM_PERMEABILITY
 
 _NEWTON_STEPS = 20
 _NEAR_A_PER_M = 0.5  # the next correction would be some millionths of it

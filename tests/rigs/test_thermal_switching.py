@@ -4,10 +4,8 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from pydantic import ValidationError
 
-from hilctl_drivers.simulated.devices import PiezoOptions, SimulatedPiezo
-from hilctl_drivers.simulated.thermal_switching import SwitchingActuator, SwitchingParameters
+from tests.rigs.thermal_switching import SwitchingActuator, SwitchingParameters
 from tests.unit.drivers.simulated.test_actuator_base import hysteresis_percent, run
 
 # A quick structure and sensor: what is left of the rate is that of the domains.
@@ -94,19 +92,3 @@ def test_cut_does_not_matter(rate_hz):
     plant.reset()
     parts = [run(plant, part) for part in np.split(drive_v, [1, 2, 17])]
     np.testing.assert_array_equal(np.concatenate(parts), whole)
-
-
-def test_options():
-    """Rest reads 0, details hold the constants, and a stage is refused."""
-    device = SimulatedPiezo(PiezoOptions(physics="thermal_switching", noise=False))
-    assert not run(device.plant(1e3), np.zeros(500)).any()
-    assert device.info.details["thermal_v"] == "1.0"
-    stage = {
-        "drive_max_v": 1.0,
-        "slope_um_per_v": 1.0,
-        "thresholds_v": (),
-        "weights_um_per_v": (),
-        "sensor_range_um": 1.0,
-    }
-    with pytest.raises(ValidationError, match="stage"):
-        PiezoOptions(physics="thermal_switching", stage=stage)

@@ -39,13 +39,11 @@ import numpy as np
 from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
 from hilctl_drivers.simulated.actuator_base import (
-    ROD_LENGTH_M,
-    ROD_RADIUS_M,
-    VACUUM_PERMEABILITY,
     Coil,
     RodParameters,
     Rods,
 )
+from tests.rigs import ROD_LENGTH_M, ROD_RADIUS_M, VACUUM_PERMEABILITY
 
 Energies: TypeAlias = tuple[float, float, float, float, float, float]
 

@@ -7,8 +7,9 @@ import pytest
 from scipy.integrate import solve_ivp
 from scipy.special import jv
 
-from hilctl_drivers.simulated.actuator_base import ROD_RADIUS_M, VACUUM_PERMEABILITY, Coil
-from hilctl_drivers.simulated.diffusion import DiffusionParameters, magnetise
+from hilctl_drivers.simulated.actuator_base import Coil
+from tests.rigs import ROD_RADIUS_M, VACUUM_PERMEABILITY
+from tests.rigs.diffusion import DiffusionParameters, magnetise
 
 RATED = DiffusionParameters()
 STEP_S = 1e-5

@@ -37,13 +37,11 @@ import numpy as np
 from hilctl.base.types import F64
 from hilctl.kernels.jit import kernel
 from hilctl_drivers.simulated.actuator_base import (
-    ROD_LENGTH_M,
-    ROD_RADIUS_M,
-    VACUUM_PERMEABILITY,
     Coil,
     RodParameters,
     Rods,
 )
+from tests.rigs import ROD_LENGTH_M, ROD_RADIUS_M, VACUUM_PERMEABILITY
 
 Material: TypeAlias = tuple[float, float, float, float, float]
 

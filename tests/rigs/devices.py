@@ -1,0 +1,96 @@
+"""The rigs as devices: ``simulated_terfenol`` with other rods, and another piezo stack."""
+
+from typing import ClassVar
+
+from hilctl.base.strict import Field
+from hilctl_drivers.simulated.devices import (
+    SimulatedDevice,
+    SimulatedOptions,
+    SimulatedTerfenol,
+    TerfenolOptions,
+)
+from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
+from tests.rigs.diffusion import DiffusionParameters
+from tests.rigs.domains import DomainsParameters
+from tests.rigs.jiles_atherton import GrowingLagParameters, JilesAthertonParameters
+from tests.rigs.thermal_switching import SwitchingActuator, SwitchingParameters
+
+RODS = {
+    "pinned_cells": PinnedCellsParameters,
+    "domains": DomainsParameters,
+    "diffusion": DiffusionParameters,
+    "jiles_atherton": JilesAthertonParameters,
+    "growing_lag": GrowingLagParameters,
+}
+
+
+class DomainsOptions(TerfenolOptions):
+    RODS: ClassVar = DomainsParameters
+
+
+class DiffusionOptions(TerfenolOptions):
+    RODS: ClassVar = DiffusionParameters
+
+
+class JilesAthertonOptions(TerfenolOptions):
+    RODS: ClassVar = JilesAthertonParameters
+
+
+class GrowingLagOptions(TerfenolOptions):
+    RODS: ClassVar = GrowingLagParameters
+
+
+OTHER_RODS = (DomainsOptions, DiffusionOptions, JilesAthertonOptions, GrowingLagOptions)
+
+
+class SimulatedDomains(SimulatedTerfenol):
+    """Domains of eight orientations, averaged over their energies."""
+
+    Options: ClassVar = DomainsOptions
+
+
+class SimulatedDiffusion(SimulatedTerfenol):
+    """The field diffuses into conducting rods, shell by shell."""
+
+    Options: ClassVar = DiffusionOptions
+
+
+class SimulatedJilesAtherton(SimulatedTerfenol):
+    """Jiles and Atherton's equations with eddy and excess loss."""
+
+    Options: ClassVar = JilesAthertonOptions
+
+
+class SimulatedGrowingLag(SimulatedTerfenol):
+    """The same with an eddy-current loss that grows with itself."""
+
+    Options: ClassVar = GrowingLagOptions
+
+
+class SwitchingOptions(SimulatedOptions):
+    sensor_noise_um: float = Field(default=1e-3, ge=0.0, le=1.0, description="rms noise, um")
+
+
+class SimulatedThermalSwitching(SimulatedDevice):
+    """A piezo stack whose domains switch over barriers by thermal activation; commands in V."""
+
+    Options: ClassVar = SwitchingOptions
+
+    def __init__(self, options):
+        self._seed = options.seed
+        noise_um = options.sensor_noise_um if options.noise else 0.0
+        self._parameters = SwitchingParameters(sensor_noise_um=noise_um)
+        super().__init__(
+            options,
+            self._parameters,
+            name="simulated_thermal_switching",
+            description="simulated piezo stack with thermal activation, and capacitive sensor",
+            command_unit="V",
+            command_min=self._parameters.drive_min_v,
+            command_max=self._parameters.drive_max_v,
+            command_step=self._parameters.drive_max_v / self._parameters.dac_codes,
+        )
+
+    def plant(self, sample_rate_hz):
+        """Return the stack at rest."""
+        return SwitchingActuator(self._parameters, sample_rate_hz, self._seed)
