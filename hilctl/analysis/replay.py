@@ -335,7 +335,7 @@ def _out(samples: Samples) -> npt.NDArray[np.bool_]:
 def _parts_of(first: Recording, model: HysteresisModel | None) -> tuple[Compensator, Limiter]:
     """Return the recorded compensator and limiter, or those with another model."""
     document = Document(f"{first.path}: experiment.yaml", first.experiment_yaml)
-    config = document.validate(Experiment)
+    config = document.validate(Experiment, without=("timing",))  # may have keys of earlier releases
     if config.sample_rate_hz != first.sample_rate_hz:
         rates = f"{first.sample_rate_hz:g} Hz, its experiment is at {config.sample_rate_hz:g}"
         raise DataError(f"{first.path}: was recorded at {rates} Hz")

@@ -235,7 +235,8 @@ def _recorded(recording: Recording, settings: Sequence[str]) -> LoadedExperiment
         return None
     document = Document(f"{recording.path} (experiment)", recording.experiment_yaml)
     hold = f"{{kind: hold, unit: {recording.command_unit}, level: 0.0, duration_s: 1.0}}"
-    plain = ("compensator=none", "feedback=null", f"waveform={hold}")
+    # The timing may have keys of earlier releases.
+    plain = ("compensator=none", "feedback=null", "timing={}", f"waveform={hold}")
     return resolve(document, recording.path.parent, (*plain, *settings))
 
 

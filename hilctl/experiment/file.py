@@ -2,8 +2,8 @@
 
 import json
 import re
-from collections.abc import Sequence
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from collections.abc import Mapping, Sequence
+from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
 from hilctl.base.device import DeviceOptions, VoltageLimit
 from hilctl.base.errors import ConfigError, ConfigProblem
@@ -55,16 +55,13 @@ Interval = Annotated[tuple[float, float], BeforeValidator(_interval)]
 class Timing(StrictModel):
     """Policy for late ticks.
 
+    A device paced by the host skips whole ticks in the waveform, and keeps the phase. A device with
+    its own sample clock catches up, because its FIFO takes the burst. Late ticks over two seconds
+    end the run.
+
     Attributes:
-        late_policy: For devices paced by the host: ``skip`` whole ticks and keep the phase,
-            ``catch_up`` with a burst, or ``slip`` the phase. Devices with their own sample clock
-            always catch up, because their FIFO takes the burst. No tick is skipped before the
-            waveform.
         late_after: Delay in tick periods after which a tick counts as late.
         max_late_s: A tick later than this ends the run.
-        max_consecutive_late: Number of consecutive late ticks that ends the run; 0 for no limit.
-            Default: the ticks of two seconds.
-        grace_s: Time after the start in which late ticks count but do not end the run.
         on_misses: Reaction to too many skipped ticks: ``fault`` ends the run with its safe ramp,
             ``warn`` reports them after the run. The command is constant in a skipped tick and jumps
             after it, so the output is no longer the checked waveform.
@@ -76,11 +73,14 @@ class Timing(StrictModel):
             protect. A stopped process (SIGSTOP) is limited to 20 ms if there is a coil.
     """
 
-    late_policy: Literal["skip", "catch_up", "slip"] = "skip"
+    REMOVED: ClassVar[Mapping[str, str]] = {
+        "late_policy": "removed: late ticks are skipped; delete the key",
+        "max_consecutive_late": "removed: two seconds of late ticks end a run; set late_after",
+        "grace_s": "removed: set on_misses: warn, or a larger max_late_s",
+    }
+
     late_after: Annotated[float, Field(gt=0.0)] = 0.5
     max_late_s: Annotated[float, Field(gt=0.0)] = 1.0
-    max_consecutive_late: Annotated[int, Field(ge=0)] | None = None
-    grace_s: Annotated[float, Field(ge=0.0)] = 0.0
     on_misses: Literal["warn", "fault"] = "fault"
     max_missed_share: Annotated[float, Field(ge=0.0, lt=1.0)] = USUAL_MISSED_SHARE
     hang_s: Annotated[float, Field(ge=0.02, le=60.0)] | None = None

@@ -431,7 +431,7 @@ class Loop:
         """
         if self._phase not in _AFTER:
             self._phase = _LEAVING
-            self._pacer.policy = self._plan.ramp_policy
+            self._pacer.policy = self._plan.late_policy
             self._code, self._reason = code, reason
         elif self._code == "completed" and code == "fault":
             self._code, self._reason = code, reason

@@ -12,7 +12,7 @@ from typing import TYPE_CHECKING, Literal, TypeAlias
 if TYPE_CHECKING:
     from hilctl.base.device import Clock
 
-LatePolicy: TypeAlias = Literal["skip", "catch_up", "slip", "follow", "spaced"]
+LatePolicy: TypeAlias = Literal["skip", "catch_up", "follow", "spaced"]
 
 USUAL_MISSED_SHARE = 0.01
 """Default share of ticks that may be skipped."""
@@ -82,7 +82,6 @@ class LateRules:
         late_after_ns: Lateness from which a tick counts as late.
         max_late_ns: Lateness that ends the run.
         max_consecutive_late: Consecutive late ticks that end the run; 0: any number is allowed.
-        grace_ticks: Ticks at the start in which lateness does not end the run.
         missed_window: Number of last ticks in which misses are counted.
         max_missed: Skipped ticks allowed in that window; more end the run if they are due to at
             least five stalls.
@@ -91,7 +90,6 @@ class LateRules:
     late_after_ns: float = math.inf
     max_late_ns: float = math.inf
     max_consecutive_late: int = 0
-    grace_ticks: int = 0
     missed_window: int = 1
     max_missed: float = math.inf
 
@@ -102,11 +100,10 @@ class Pacer:
     Args:
         period_ns: Period of the ticks; may be fractional.
         policy: What follows a tick that is a period or more late; may be changed between ticks.
-            ``skip``: skip ticks to keep the phase. ``catch_up``: run all ticks. ``slip``: shift the
-            schedule. ``follow``: the exchange waits for the device's clock, and the deadlines
-            follow that clock. ``spaced``, for the start of a run: each tick waits a whole period
-            after the end of the previous one, so two writes are never closer, however long an
-            exchange took.
+            ``skip``: skip ticks to keep the phase. ``catch_up``: run all ticks. ``follow``: the
+            exchange waits for the device's clock, and the deadlines follow that clock. ``spaced``,
+            for the start of a run: each tick waits a whole period after the end of the previous
+            one, so two writes are never closer, however long an exchange took.
     """
 
     def __init__(
@@ -157,9 +154,6 @@ class Pacer:
             self._count()
         if self.late_ns < self._period_ns or self.policy in {"catch_up", "follow", "spaced"}:
             return 0
-        if self.policy == "slip":
-            self._origin_ns += self.late_ns
-            return 0
         skipped = int(self.late_ns / self._period_ns)
         self.tick += skipped
         self.counters.skipped_ticks += skipped
@@ -171,8 +165,6 @@ class Pacer:
     def too_late(self) -> str:
         """Return why lateness ends the run, or an empty text."""
         rules = self._rules
-        if self.tick < rules.grace_ticks:
-            return ""
         if self.late_ns > rules.max_late_ns:
             limit = f"timing.max_late_s ({rules.max_late_ns * 1e-9:g} s)"
             return f"tick {self.tick} woke {self.late_ns * 1e-9:.3f} s late, more than {limit}"
@@ -183,8 +175,6 @@ class Pacer:
     def _note_stall(self, skipped: int) -> None:
         """Count skipped ticks in the window of the last ticks."""
         rules = self._rules
-        if self.tick < rules.grace_ticks:
-            return
         self._stalls.append((self.tick, skipped))
         self._missed += skipped
         while self._stalls[0][0] <= self.tick - rules.missed_window:

@@ -28,9 +28,8 @@ class LoopPlan:
             corrections; the reference itself without a compensator.
         block: Samples per exchange.
         latency_blocks: Exchanges from a block's commands to its displacements.
-        late_policy: Policy for late ticks in the waveform.
-        start_policy: Policy in the initial ramp and the conditioning.
-        ramp_policy: Policy in the safe ramp.
+        late_policy: Policy for late ticks in waveform and safe ramp. If the host paces the device,
+            ``skip``: otherwise the ramp would take long on a slow one.
         keep_all: Whether a block that is dropped because the ring is full ends the run.
     """
 
@@ -44,14 +43,17 @@ class LoopPlan:
     interlocks: InterlockContext
     interlock_settings: InterlockSettings = field(default_factory=InterlockSettings)
     late_policy: LatePolicy = "skip"
-    start_policy: LatePolicy = "spaced"
-    ramp_policy: LatePolicy = "skip"
     late_rules: LateRules = field(default_factory=LateRules)
     feedback: Controller | None = None
     adaptation: Adaptation | None = None
     conditioning: Conditioning | None = None
     triggers: Triggers | None = None
     keep_all: bool = True
+
+    @property
+    def start_policy(self) -> LatePolicy:
+        """Policy in the initial ramp and the conditioning, where no tick is skipped."""
+        return "spaced" if self.late_policy == "skip" else self.late_policy
 
     @property
     def waits(self) -> bool:

@@ -67,8 +67,6 @@ def assemble(
     """
     config, info = loaded.config, loaded.device.info
     rate_hz = config.sample_rate_hz
-    policy = _late_policy(config, info) if paced else "catch_up"
-    host_paced = paced and not info.buffered and not info.latency_blocks
     compensator = Compensator(loaded.model, rate_hz)
     compensator.warm_up()
     if state is not None:
@@ -83,10 +81,7 @@ def assemble(
         limits=config.command_limits(),
         interlocks=replace(interlock_context(config, info), heat_a2=heat_a2),
         interlock_settings=config.interlocks,
-        late_policy=policy,
-        start_policy="spaced" if host_paced else policy,
-        # By time, not by ticks: otherwise the ramp would take long on a slow device.
-        ramp_policy="skip" if host_paced else policy,
+        late_policy=_late_policy(info) if paced else "catch_up",
         late_rules=_late_rules(config, reference.size) if paced else LateRules(),
         feedback=make_feedback(config, compensator, info.latency_blocks),
         adaptation=make_adaptation(config, operator, compensator),
@@ -96,20 +91,19 @@ def assemble(
     )
 
 
-def _late_policy(config: Experiment, info: DeviceInfo) -> LatePolicy:
+def _late_policy(info: DeviceInfo) -> LatePolicy:
     if info.latency_blocks:
         return "follow"
-    return "catch_up" if info.buffered else config.timing.late_policy
+    return "catch_up" if info.buffered else "skip"
 
 
 def _late_rules(config: Experiment, samples: int) -> LateRules:
-    timing, late = config.timing, config.timing.max_consecutive_late
+    timing = config.timing
     window = min(round(_MISSED_WINDOW_S / config.tick_s), math.ceil(samples / config.block))
     return LateRules(
         late_after_ns=timing.late_after * config.tick_s * 1e9,
         max_late_ns=timing.max_late_s * 1e9,
-        max_consecutive_late=math.ceil(_ALWAYS_LATE_S / config.tick_s) if late is None else late,
-        grace_ticks=int(timing.grace_s / config.tick_s),
+        max_consecutive_late=math.ceil(_ALWAYS_LATE_S / config.tick_s),
         missed_window=max(1, window),
         max_missed=timing.max_missed_share * window if timing.on_misses == "fault" else math.inf,
     )

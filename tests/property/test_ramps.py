@@ -191,15 +191,13 @@ class TestStart:
 class TestByTime:
     """A device that is late for each exchange."""
 
-    @pytest.mark.parametrize("policy", ["skip", "catch_up", "slip"])
     @pytest.mark.parametrize("exchange_s", [0.05, 0.1, 0.4])
-    def test_ramp_out_takes_its_time_and_not_its_ticks(self, exchange_s, policy):
+    def test_ramp_out_takes_its_time_and_not_its_ticks(self, exchange_s):
         """From 5 A, 0.05 s of ramp: four strides of a quarter each, and the tick that leaves."""
         stop_s, late_from = 0.3, 100
         rig = slow_rig(
             lambda number: exchange_s if number >= late_from else 0.0,
             np.full(10_000, 5.0),
-            policy=policy,
             stop=lambda: "stopped" if rig.device.clock.now > stop_s * 1e9 else "",
         )
         assert rig.run().code == "stopped"

@@ -56,6 +56,11 @@ def test_the_sound_recording_is_identical_and_another_model_is_not(recording):
     assert other.predicted.rms_percent > other.predicted.recorded_rms_percent
 
 
+def test_recording_with_timing_of_an_earlier_release_is_replayed(recording):
+    text = recording.experiment_yaml + "timing: {late_policy: skip, grace_s: 0.5}\n"
+    assert replay(replace(recording, experiment_yaml=text)).identical
+
+
 def test_a_model_of_another_unit_is_refused(recording):
     piezo = load_model(CONFIGS / "models" / "piezo_ppi.yaml")
     with pytest.raises(DataError, match=r"commands in V"):

@@ -48,11 +48,10 @@ safe:
   value: 0.5
   ramp_s: 0.2
 timing:
-  late_policy: catch_up
   late_after: 0.25
   max_late_s: 2.0
-  max_consecutive_late: 7
-  grace_s: 0.5
+  on_misses: warn
+  hang_s: 0.5
 recording:
   folder: runs
   flush_s: 0.5
@@ -171,7 +170,8 @@ ONE_RULE = [
     ("stroke_um", "[-75.0, 60.0]", "[60.0, -75.0]", "limits.stroke_um"),
     ("stroke_um", "[-75.0, 60.0]", "[low, 60.0]", "limits.stroke_um.0"),
     ("value", "value: 0.5", "value: 7.1", "safe.value"),
-    ("late_policy", "late_policy: catch_up", "late_policy: hurry", "timing.late_policy"),
+    ("on_misses", "on_misses: warn", "on_misses: hurry", "timing.on_misses"),
+    ("hang_s", "hang_s: 0.5", "grace_s: 0.5", "timing.grace_s"),
     ("scope_rate_hz", "scope_rate_hz: 500.0", "scope_rate_hz: 1001", "recording.scope_rate_hz"),
     ("ring_s", "ring_s: 20.0", "ring_s: 1.0", "recording"),
     ("seed", "seed: 3", "sed: 3", "device.sed"),
@@ -248,13 +248,13 @@ class TestSet:
                 "waveform.frequency_hz=20.0",
                 "limits.stroke_um.1=55.5",
                 "device.fault=null",
-                "timing={late_policy: slip}",
+                "timing={on_misses: fault}",
                 "name='7'",
             ),
         ).config
         assert (config.block, config.name, config.limits.stroke_um) == (10, "7", (-75.0, 55.5))
         assert config.waveform.model_dump()["frequency_hz"] == 20.0
-        assert config.timing.late_policy == "slip"
+        assert config.timing.on_misses == "fault"
         assert config.timing.late_after == 0.5
 
     @pytest.mark.parametrize(("setting", "key"), [

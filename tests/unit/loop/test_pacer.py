@@ -104,9 +104,9 @@ def test_a_postponed_tick_is_due_in_a_period(now_ns, due_ns):
 
 
 class TestMisses:
-    def stalled(self, stalls_ns, ticks=400, grace_ticks=0):
+    def stalled(self, stalls_ns, ticks=400):
         """Run ticks, with stalls by the number of the sleep; return the first reason, its tick."""
-        rules = LateRules(grace_ticks=grace_ticks, missed_window=1000, max_missed=10.0)
+        rules = LateRules(missed_window=1000, max_missed=10.0)
         paced = Pacer(FakeClock(0, stalls_ns), PERIOD_NS, "skip", rules)
         paced.begin(0)
         for _ in range(ticks):
@@ -144,17 +144,6 @@ class TestMisses:
         stalls = {0: PERIOD_NS} | dict.fromkeys((1, 2, 3), 3 * PERIOD_NS) | {last: PERIOD_NS}
         assert bool(self.stalled(stalls, ticks=1100)[0]) == ends
 
-    def test_the_grace_at_the_start_counts_for_nothing(self):
-        often = {20 * number: PERIOD_NS for number in range(14)}
-        assert self.stalled(often)[0]
-        assert self.stalled(often, grace_ticks=100)[0] == ""
-
-    @pytest.mark.parametrize(("grace_ticks", "ends"), [(1, True), (2, False)])
-    def test_the_grace_ends_before_its_tick(self, grace_ticks, ends):
-        """The first of five stalls comes at tick 1."""
-        stalls = {0: PERIOD_NS} | dict.fromkeys((1, 2, 3, 4), 3 * PERIOD_NS)
-        assert bool(self.stalled(stalls, ticks=10, grace_ticks=grace_ticks)[0]) == ends
-
 
 @pytest.mark.parametrize(("skipped", "due", "text"), [
     (0, 3003, ""),
@@ -176,15 +165,6 @@ def test_catch_up_runs_every_tick():
     assert late == [0, 0, 3_200_000, 2_200_000, 1_200_000, 200_000, 0, 0]
     assert paced.tick == 7
     assert paced.counters.longest_run == 3
-
-
-def test_slip_moves_the_grid():
-    clock = FakeClock(5_000, {2: 3_200_000})
-    paced = pacer(clock, "slip")
-    for _ in range(4):
-        assert paced.wait() == 0
-    assert paced.deadline_ns == 10_000 + 3 * PERIOD_NS + 3_200_000
-    assert paced.late_ns == 0
 
 
 def test_system_clock_sleeps_to_a_deadline():
@@ -239,14 +219,6 @@ class TestTooLate:
         paced = self.paced(stalls_ns, ticks, max_consecutive_late=3)
         assert paced.too_late() == ("3 ticks in a row woke late, up to tick 5" if ends else "")
         assert paced.counters.longest_run == ticks - 3
-
-    @pytest.mark.parametrize(
-        ("ticks", "grace_ticks", "ends"), [(1, 0, True), (4, 4, False), (5, 4, True)]
-    )
-    def test_the_grace_ends_with_its_tick(self, ticks, grace_ticks, ends):
-        rules = {"max_late_ns": 1.0, "grace_ticks": grace_ticks}
-        paced = self.paced({0: 100 * PERIOD_NS}, ticks, **rules)
-        assert bool(paced.too_late()) == ends
 
 
 class TestFollow:

@@ -166,8 +166,6 @@ def run_loop(driven, n):
         limits=limits,
         interlocks=InterlockContext(stroke_um=(-100.0, 100.0)),
         late_policy="follow",
-        start_policy="follow",
-        ramp_policy="follow",
     )
     return Loop(plan, driven.device, host).run(host.clock.now_ns()), host
 
