@@ -12,7 +12,7 @@ from contextlib import ExitStack, suppress
 from typing import Any, Literal
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.run.run_folder import GUARDIAN, DeviceLocks, RunFolder, runs
+from hilctl.run.run_folder import GUARDIAN, LOOP, DeviceLocks, RunFolder, runs
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase, SharedPage
 
@@ -69,7 +69,7 @@ class LoopProcess(ChildProcess):
     def __init__(self, folder: RunFolder, page: SharedPage, inherits: Sequence[int]) -> None:
         self._page = page
         try:
-            process = start_process("hilctl.run.loop_process", str(folder.job), inherits=inherits)
+            process = start_process(LOOP, str(folder.job), inherits=inherits)
         except OSError as error:
             raise RunError(f"cannot start the loop process: {error.strerror}") from None
         super().__init__(process)

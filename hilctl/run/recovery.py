@@ -2,6 +2,7 @@
 
 import signal
 import threading
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass, replace
@@ -19,6 +20,9 @@ from hilctl.run.metadata import end_facts
 from hilctl.run.run_folder import RunFolder, runs, taken_over
 from hilctl.run.shared.ring import SampleRing, safe_result_of
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase
+
+_RESULT_S = 1.0
+_POLL_S = 0.02
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,8 +47,9 @@ def recover_dead_runs() -> list[RecoveredRun]:
     for run in runs():
         if run.recorded and not run.alive and _is_settled(run):
             run.remove()
-        if run.recorded or run.supervised or (run.alive and safe_result_of(run) is None):
+        if run.recorded or run.supervised or run.loops:
             continue
+        _await_guardian(run)
         with taken_over(run) as ours, _undisturbed():
             if ours:
                 found.append(recovered := _recover(run))
@@ -52,6 +57,15 @@ def recover_dead_runs() -> list[RecoveredRun]:
                     finish_state(recovered.recording, MachineTime.now())
                     _finish(run, recovered)
     return found
+
+
+def _await_guardian(run: RunFolder) -> None:
+    """Wait briefly for the result of a guardian that has just begun to act."""
+    until_s = time.monotonic() + _RESULT_S
+    while run.alive and time.monotonic() < until_s:
+        if (result := safe_result_of(run)) and (result.final or result.output == "set"):
+            return
+        time.sleep(_POLL_S)
 
 
 def _finish(run: RunFolder, recovered: RecoveredRun) -> None:

@@ -49,7 +49,8 @@ _DEVICES = "devices"
 _REMOVED = " (deleted)"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
 GUARDIAN = "hilctl.run.safety.guardian"
-"""Module of the guardian's process."""
+LOOP = "hilctl.run.loop_process"
+"""Modules of the processes of a run."""
 _IF_OWN = "wait for its end, or stop it first"
 _IF_STRANGER = "ask its user to stop it; hilctl run --take-over runs nevertheless"
 _BACKLOG = 1000  # connections that query the holder of a device; never accepted
@@ -114,6 +115,11 @@ class RunFolder:
     def alive(self) -> bool:
         """Whether a process of the run is alive."""
         return _is_locked(self._file(_CARD))
+
+    @property
+    def loops(self) -> bool:
+        """Whether the loop process is alive."""
+        return self.job in jobs_of(LOOP)
 
     def keep(self, *, recorded: bool) -> None:
         """Keep the folder after the supervisor, for an output or samples that are not safe yet."""
@@ -435,16 +441,21 @@ def _in_use(name: str, holder: tuple[int, int] | None, hint: str = _IF_OWN) -> I
     return InputError(f"{name} is in use by {_text_of(holder)}: {hint}")
 
 
+def jobs_of(module: str) -> Iterator[Path]:
+    """Yield the job of each live process that runs a module of a run."""
+    for command in Path("/proc").glob("[0-9]*/cmdline"):
+        with suppress(OSError, ValueError, IndexError):  # it has ended, or is another program
+            words = os.fsdecode(command.read_bytes()).split("\0")
+            yield Path(words[words.index(module) + 1])
+
+
 def _guardian_of(name: str) -> RunFolder | None:
     """Return the run whose guardian holds a resource after its supervisor, in any folder."""
-    for command in Path("/proc").glob("[0-9]*/cmdline"):
-        with suppress(OSError, ValueError, TypeError):  # ended, or no run
-            words = command.read_bytes().split(b"\0")
-            if GUARDIAN.encode() in words:
-                folder = Path(os.fsdecode(words[words.index(GUARDIAN.encode()) + 1])).parent
-                card = RunCard.from_json((folder / _CARD).read_text(encoding="utf-8"))
-                if name in card.holds and not (run := RunFolder(folder, card)).supervised:
-                    return run
+    for job in jobs_of(GUARDIAN):
+        with suppress(OSError, ValueError, TypeError):
+            card = RunCard.from_json((job.parent / _CARD).read_text(encoding="utf-8"))
+            if name in card.holds and not (run := RunFolder(job.parent, card)).supervised:
+                return run
     return None
 
 

@@ -34,6 +34,7 @@ from tests.benchmark.other_reader import verdict
 SLOW_WRITE = Path(__file__).with_name("slow_write.c")
 OBSERVED_S = 1.0
 SAFE_A = 2e-3
+ENDED = {Phase.ENDED, Phase.FAILED, Phase.REFUSED}
 END_S = 60.0
 READABLE_S = 5.0
 STAYS = ", does not end"
@@ -58,7 +59,7 @@ class Attack:
         beyond_ramp_s: Time until the output stayed at its safe value, from the attack or, if the
             loop was to go on, from the end of the run, less what the safe ramp takes.
         largest_step: Largest step from then on, over what the safe ramp may move meanwhile.
-        readable_s: Time from the end of the attack until the recording was complete.
+        readable_s: Time from the end of the loop until the recording was complete.
         reader: What another reader says against the recording; empty if it agrees.
         is_false: Whether "confirmed" was recorded of an output that was not at its safe value.
     """
@@ -160,6 +161,7 @@ def attack(
     for number in (signal.SIGCONT, signal.SIGTERM):  # a supervisor that was stopped ends its run
         with suppress(ProcessLookupError):
             run.process.send_signal(number)
+    _await_loop(run, page, processes.get("loop", 0))
     began_s = time.monotonic()
     _await_supervisor(run)
     run.recover()
@@ -188,6 +190,26 @@ def _hit_recovery(run: AttackedRun, chance: random.Random) -> str:
     return f"{what} the next command"
 
 
+def _await_loop(run: AttackedRun, page: SharedPage, loop: int) -> None:
+    """Wait until a loop has ended, for a limited time: it may still try to confirm."""
+    deadline = time.monotonic() + END_S
+    while time.monotonic() < deadline and page.get(PageField.PHASE) not in ENDED:
+        if run.process.poll() is not None:
+            _continue(run.processes())
+        try:
+            if b") Z" in Path(f"/proc/{loop}/stat").read_bytes():
+                return
+        except FileNotFoundError:
+            return
+        time.sleep(0.01)
+
+
+def _continue(processes: list[int]) -> None:
+    for each in processes:
+        with suppress(ProcessLookupError):
+            os.kill(each, signal.SIGCONT)
+
+
 def _await_supervisor(run: AttackedRun) -> None:
     """Wait until the command of the run has ended, for a limited time."""
     with suppress(subprocess.TimeoutExpired):
@@ -203,9 +225,7 @@ def _await_end(run: AttackedRun, page: SharedPage) -> str:
     deadline = time.monotonic() + END_S
     while left := run.processes():
         ended = run.process.poll() is not None
-        for each in left if ended else []:
-            with suppress(ProcessLookupError):
-                os.kill(each, signal.SIGCONT)
+        _continue(left if ended else [])
         result = page.safe_result()
         if ended and result is not None and result.output == "set":
             with suppress(ProcessLookupError):

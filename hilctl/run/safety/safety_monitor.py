@@ -209,16 +209,13 @@ class SafetyMonitor:
     def _hand_over(self, action: SafeAction, stopped: Callable[[], bool]) -> bool:
         """Hand an unconfirmed output over to the guardian; continue here until that works.
 
-        Return False if the output is confirmed, at a stop, or if no process can act.
+        A stop does not wait for it. Return whether a guardian is active.
         """
         give_up_s = time.monotonic() + _HAND_OVER_S
         while not stopped() and not (action.failed and time.monotonic() > give_up_s):
             guardian = self._guardian
             if guardian is not None and guardian.phase == GuardianPhase.WAITING:
-                while not action.end(_POLL_S):
-                    pass  # the last write ends after the timeout of the device
-                self._device.close()
-                self._page.put(PageField.STANDS_IN, 0)
+                self._release(action)
                 if guardian.await_acting(stopped):
                     return True
             if action.is_over or guardian is None or guardian.ended:
@@ -230,4 +227,12 @@ class SafetyMonitor:
             if self.result.final:
                 self._page.put(PageField.RELIEVED, 1)
                 return False
-        return False
+        self._release(action)
+        return self._guardian is not None and not self._guardian.ended
+
+    def _release(self, action: SafeAction) -> None:
+        """Stop writing, and leave the device to the guardian that waits for it."""
+        while not action.end(_POLL_S):
+            pass  # the last write ends after the timeout of the device
+        self._device.close()
+        self._page.put(PageField.STANDS_IN, 0)
