@@ -101,12 +101,12 @@ class CheckedExperiment:
 
 
 def check(
-    loaded: LoadedExperiment, heat_a2: float = 0.0, now: MachineTime | None = None
+    loaded: LoadedExperiment, heat_a2: float | None = 0.0, now: MachineTime | None = None
 ) -> CheckedExperiment:
     """Compute the complete run and check it against device, model and limits.
 
-    The heat of the coil is at least ``heat_a2``, in A^2, whatever the last run left. ``now`` is
-    the time of the start; None for the present.
+    The heat of the coil is at least ``heat_a2``, in A^2, whatever the last run left; None for a
+    coil that has cooled down by then. ``now`` is the time of the start; None for the present.
 
     Raises:
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
@@ -136,7 +136,8 @@ def check(
         now = MachineTime.now() if now is None else now
         begun = _start(loaded, reference, conditioned, now, problems)
         left_a2, unknown = heat_before(loaded, now)
-        heat_a2 = max(heat_a2, left_a2)
+        held_a2 = config.safe.value**2
+        heat_a2 = held_a2 if heat_a2 is None else max(heat_a2, left_a2)
         forecast = forecast_of(loaded, reference, begun, conditioned, heat_a2)
     except ModelError as error:
         raise ConfigError([*problems, loaded.problem("compensator.model", str(error))]) from None

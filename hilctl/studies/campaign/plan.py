@@ -9,13 +9,11 @@ from hilctl.base.files import TextFiles
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.preflight import check
-from hilctl.experiment.state_files import MachineTime
 from hilctl.run.start import RunKey
 from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, key_of, locs_of
 from hilctl.studies.step_runner import free_mb
 
 _MOST_PROBLEMS = 20
-_LONG_AFTER = MachineTime(unix_s=1e12, boot_s=1e12)
 _NO_HEAT = RunHeat()
 
 
@@ -113,8 +111,8 @@ def _checked(
 ) -> PlannedStep:
     same = known.get(each.step.settings)
     if same is None:
-        # Far in the future: heat of the last run causes a pause, not an error.
-        forecast = check(each.loaded, now=_LONG_AFTER).forecast
+        # Cooled down: heat of the last run causes a pause, not an error.
+        forecast = check(each.loaded, heat_a2=None).forecast
         same = replace(each, heat=forecast.heat, megabytes=forecast.recording_mb)
         known[each.step.settings] = same
     return replace(each, heat=same.heat, megabytes=same.megabytes)

@@ -4,6 +4,7 @@ import pytest
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.studies.campaign.plan import planned
+from tests.unit.base.test_calibration import CALIBRATION
 from tests.unit.studies.campaign.conftest import CAMPAIGN
 
 HOT = "set: {limits.rms_current_a: 0.7, limits.thermal_time_constant_s: 2.0}\n"
@@ -64,3 +65,18 @@ def test_completed_steps_are_not_planned(campaign, tmp_path):
     assert [each.kept is not None for each in again.steps] == [True] + [False] * 7
     longer = campaign(CAMPAIGN + "set: {waveform.duration_s: 0.5}")
     assert len(planned(longer, tmp_path, completed, 0.0).left) == 4
+
+
+def test_a_calibration_is_no_obstacle(campaign, tmp_path):
+    (tmp_path / "calibration.yaml").write_text(CALIBRATION, encoding="utf-8")
+    keys = "device.calibration: calibration.yaml, limits.stroke_um: [-45.0, 45.0]"
+    text = CAMPAIGN + f"set: {{{keys}}}\n"
+    assert len(planned(campaign(text), tmp_path / "runs", {}, 0.0).left) == 4
+    assert len(planned(campaign(text), tmp_path / "runs", {}).left) == 4
+
+
+def test_heat_of_the_last_run_is_no_error(campaign, tmp_path, monkeypatch):
+    """It causes a pause."""
+    monkeypatch.setattr("hilctl.experiment.preflight.heat_before", lambda loaded, now_s: 0.48)
+    plan = planned(campaign(CAMPAIGN + HOT), tmp_path, {}, 0.48)
+    assert plan.steps[0].pause_s > 0.0
