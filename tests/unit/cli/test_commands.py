@@ -8,10 +8,11 @@ from pathlib import Path
 from types import SimpleNamespace
 
 import pytest
+import typer
 
 from hilctl import __version__
 from hilctl.base.errors import InputError
-from hilctl.cli.commands import COMMANDS, load
+from hilctl.cli.commands import COMMANDS, app, load
 
 RECORDING = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 MAIN = "from hilctl.cli import main; main()"
@@ -123,9 +124,26 @@ finally:
 
 def test_help_names_every_command(hilctl):
     text = hilctl("--help")[1]
-    for name in COMMANDS:
-        summary = load(name).help.splitlines()[0]
-        assert re.search(rf"^ +{name} .*{re.escape(summary[:30])}", text, re.MULTILINE), name
+    table = typer.main.get_group(app).commands
+    assert list(table) == list(COMMANDS)
+    for name, line in table.items():
+        assert line.short_help == load(name).help.splitlines()[0], name
+        assert re.search(rf"^ +{name} .*{re.escape(line.short_help[:30])}", text, re.MULTILINE)
+
+
+def test_help_reads_no_source():
+    """An installation may have none."""
+    code = """
+import sys
+from hilctl.cli import commands, main
+def refuse(event, words):
+    if event == "open" and "/cli/" in str(words[0]) and str(words[0]).endswith(".py"):
+        raise FileNotFoundError(words[0])
+sys.addaudithook(refuse)
+main()
+"""
+    ended = in_a_process(code, "--help")
+    assert ended.returncode == 0, ended.stderr
 
 
 def test_version(hilctl):
