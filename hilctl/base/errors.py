@@ -12,12 +12,17 @@ HilctlError
 
 from collections.abc import Iterable
 from dataclasses import dataclass
+from typing import Any
 
 
 class HilctlError(Exception):
     """Base of all errors raised on purpose; the text is shown to the user."""
 
     exit_code = 3
+
+    def __reduce__(self) -> tuple[Any, ...]:
+        # Exceptions are unpickled by calling the class with the text; some take other arguments.
+        return type(self).__new__, (type(self), *self.args), vars(self)
 
 
 class InputError(HilctlError):
@@ -60,9 +65,6 @@ class ConfigError(InputError):
     def __init__(self, problems: Iterable[ConfigProblem]) -> None:
         self.problems = tuple(problems)
         super().__init__("\n".join(str(problem) for problem in self.problems))
-
-    def __reduce__(self) -> tuple[type["ConfigError"], tuple[tuple[ConfigProblem, ...]]]:
-        return ConfigError, (self.problems,)
 
 
 class ModelError(InputError):

@@ -1,5 +1,12 @@
 """What errors say, and who is caught by whom."""
 
+import pickle
+import re
+from importlib import import_module
+from inspect import signature
+from pathlib import Path
+from types import FunctionType
+
 import pytest
 
 from hilctl.base import errors
@@ -29,3 +36,24 @@ def test_what_the_user_gave_is_told_from_what_happened():
     assert all(issubclass(each, HilctlError) for each in found)
     assert not issubclass(DeviceError, InputError)
     assert issubclass(ConfigError, InputError)
+
+
+def subclasses(kind):
+    return {kind}.union(*map(subclasses, kind.__subclasses__()))
+
+
+def test_every_error_passes_from_process_to_process():
+    """Its class, its text and all that it holds are those that were raised."""
+    root = Path(__file__).parents[3]
+    for package in (root, root / "drivers"):
+        for path in package.glob("hilctl*/**/*.py"):
+            if re.search(r"^class \w+Error\(", path.read_text(encoding="utf-8"), re.MULTILINE):
+                import_module(".".join(path.relative_to(package).with_suffix("").parts))
+    values = {"problems": [ConfigProblem("a", "x", "one")], "number": 2, "code": "E01"}
+    for kind in subclasses(HilctlError):
+        own = isinstance(kind.__init__, FunctionType)
+        names = [*signature(kind).parameters] if own else ["text"]
+        error = kind(*(values.get(name, f"a {name}") for name in names))
+        error.add_note("a note")
+        again = pickle.loads(pickle.dumps(error))
+        assert (type(again), str(again), vars(again)) == (kind, str(error), vars(error))
