@@ -1,8 +1,20 @@
-"""Commands that tests start in processes of their own, as a user types them."""
+"""Commands in processes of their own, as a user types them, and in this one."""
 
 import subprocess
 import sys
-from typing import Any
+from typing import Any, NamedTuple
+
+import pytest
+
+from hilctl import cli
+
+
+class Ended(NamedTuple):
+    """How a command ended."""
+
+    code: int
+    out: str
+    err: str
 
 
 def typed(*words: object) -> list[str]:
@@ -20,3 +32,16 @@ def ended(command: list[str], code: int = 0, **options: Any) -> subprocess.Compl
 
 def hilctl(*words: object, code: int = 0, **options: Any) -> subprocess.CompletedProcess[str]:
     return ended(typed(*words), code, **options)
+
+
+def in_process(monkeypatch, capsys):
+    """Return a function that runs a command in this process, and returns how it ended."""
+
+    def run(*words):
+        monkeypatch.setattr(sys, "argv", ["hilctl", *map(str, words)])
+        with pytest.raises(SystemExit) as ended:
+            cli.main()
+        assert isinstance(ended.value.code, int)
+        return Ended(ended.value.code, *capsys.readouterr())
+
+    return run

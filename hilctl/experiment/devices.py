@@ -8,16 +8,18 @@ The module of a device is imported only when the device is chosen. A package add
 The guardian imports this module, so it must not import numba.
 """
 
-from collections.abc import Callable
-from contextlib import suppress
+from collections.abc import Callable, Iterator
+from contextlib import contextmanager, suppress
 from dataclasses import dataclass
+from functools import wraps
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, NamedTuple
+from typing import Any, NamedTuple, cast
 
-from hilctl.base.device import Device, VoltageLimit, complete
-from hilctl.base.errors import ConfigError, InputError
+from hilctl.base.alarm import time_limit
+from hilctl.base.device import Device, DeviceInfo, VoltageLimit, complete
+from hilctl.base.errors import ConfigError, DeviceError, HilctlError, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
 from hilctl.base.yaml import Document, load_document
@@ -56,12 +58,69 @@ def device_class(kind: str) -> type[Device]:
     known = known_devices()
     if kind not in known:
         raise InputError(f"unknown device '{kind}' ({did_you_mean(kind, list(known))})")
-    try:
+    with _named_errors(kind, "cannot load"):
         found: type[Device] = resolve_name(known[kind])
-        _ = found.Options
-    except (ImportError, AttributeError) as error:
-        raise InputError(f"cannot load device '{kind}': {error}") from error
+        _ = found.Options.model_fields
     return found
+
+
+def options_schema(kind: str) -> dict[str, Any]:
+    """Return the JSON schema of a device's options; raise InputError as :func:`device_class`."""
+    options = device_class(kind).Options
+    with _named_errors(kind, "cannot describe"):
+        return options.model_json_schema()
+
+
+@contextmanager
+def _named_errors(kind: str, what: str) -> Iterator[None]:
+    """Raise InputError for whatever a device's own code raises, if it exits or does not return."""
+    try:
+        with time_limit():
+            yield
+    except (InputError, MemoryError):
+        raise
+    except (Exception, SystemExit) as error:
+        place = known_devices().get(kind)
+        raise InputError(f"{what} device '{kind}' ({place}): {_worded(error)}") from error
+
+
+def _worded(error: BaseException) -> str:
+    return f"{type(error).__name__}: {error}"
+
+
+_METHODS = ("check_rate", "open", "output", "exchange", "make_safe", "close")
+_MORE_METHODS = ("arm", "look", "set_digital", "read_digital")
+
+
+def _contained(kind: str, device: Device) -> Device:
+    """Return a device whose methods raise DeviceError for whatever those of ``device`` raise.
+
+    ``check_rate`` raises InputError, because nothing has moved. The device's own calls of its
+    methods are left alone.
+    """
+
+    def contained(name: str) -> Callable[..., Any]:
+        method: Callable[..., Any] = getattr(device, name)
+
+        @wraps(method)
+        def call(*given: object) -> Any:
+            try:
+                return method(*given)
+            except HilctlError:
+                raise
+            except (Exception, SystemExit) as error:
+                text = f"{kind}: {name} of {known_devices().get(kind)} failed: {_worded(error)}"
+                raise (InputError if name == "check_rate" else DeviceError)(text) from error
+
+        return staticmethod(call)
+
+    members: dict[str, Any] = {
+        name: contained(name) for name in _METHODS + _MORE_METHODS if hasattr(device, name)
+    }
+    members["__getattr__"] = lambda _, name: getattr(device, name)
+    members["__setattr__"] = lambda _, name, value: setattr(device, name, value)
+    # Methods of the class: protocols look for them there.
+    return cast(Device, type(type(device).__name__, (), members)())
 
 
 def made_device(document: Document, folder: Path, files: TextFiles) -> Device | None:
@@ -77,18 +136,24 @@ def made_device(document: Document, folder: Path, files: TextFiles) -> Device | 
     try:
         chosen = device_class(kind)
     except InputError as error:
-        raise ConfigError([document.problem("device.kind", str(error))]) from None
+        raise ConfigError([document.problem("device.kind", str(error))]) from error
     context: dict[str, object] = {"folder": folder, "files": files}
     if "amplifier" in document.data:
         with suppress(ConfigError):  # an invalid one is reported as a key of the experiment
             context["amplifier"] = document.validate(VoltageLimit, at=("amplifier",))
-    options = document.validate(chosen.Options, at=("device",), without=("kind",), context=context)
     try:
-        return complete(chosen(options))
+        with _named_errors(kind, "cannot make"):
+            options = document.validate(
+                chosen.Options, at=("device",), without=("kind",), context=context
+            )
+            device = complete(chosen(options))
+            if not isinstance(device.info, DeviceInfo):
+                raise TypeError(f"info must be a DeviceInfo, got {device.info!r}")
     except ConfigError:
         raise
     except InputError as error:
-        raise ConfigError([document.problem("device", str(error))]) from None
+        raise ConfigError([document.problem("device", str(error))]) from error
+    return device if kind in BUILTIN else _contained(kind, device)
 
 
 def shipped_profiles() -> dict[str, str]:
@@ -176,7 +241,7 @@ def describe(name: str) -> DeviceDescription:
     if name not in kinds:
         hint = did_you_mean(name, [*kinds, *profiles])
         raise InputError(f"there is no device or profile '{name}' ({hint})")
-    schema = device_class(name).Options.model_json_schema()
+    schema = options_schema(name)
     needed = schema.get("required", [])
     options = tuple(
         DeviceOption(

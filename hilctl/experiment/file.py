@@ -5,7 +5,7 @@ import re
 from collections.abc import Mapping, Sequence
 from typing import Annotated, Any, ClassVar, Literal, Self, TypeAlias
 
-from hilctl.base.device import DeviceOptions, VoltageLimit
+from hilctl.base.device import VoltageLimit
 from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.segments import Segment
 from hilctl.base.strict import (
@@ -18,7 +18,7 @@ from hilctl.base.strict import (
     model_validator,
 )
 from hilctl.base.types import CommandUnit
-from hilctl.experiment.devices import device_class, known_devices
+from hilctl.experiment.devices import known_devices, options_schema
 from hilctl.loop.interlocks import InterlockSettings
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import USUAL_MISSED_SHARE
@@ -514,8 +514,7 @@ def experiment_schema() -> dict[str, Any]:
     definitions = schema["$defs"]
     choices = []
     for kind in known_devices():
-        options: type[DeviceOptions] = device_class(kind).Options
-        part = options.model_json_schema()
+        part = options_schema(kind)
         definitions.update(part.pop("$defs", {}))
         part["properties"] = {"kind": {"const": kind}, **part.get("properties", {})}
         part["required"] = ["kind", *part.get("required", [])]

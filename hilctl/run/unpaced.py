@@ -5,12 +5,14 @@ Check, loop, compensator, limiter, interlocks and recorder are those of a paced 
 
 import time
 from collections.abc import Callable
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
+from hilctl.base.alarm import PATIENCE_S, alarm, time_limit
 from hilctl.base.device import Clock, Device
-from hilctl.base.errors import HilctlError, InputError
+from hilctl.base.errors import DeviceError, HilctlError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, Samples
 from hilctl.experiment.preflight import CheckedExperiment
@@ -62,6 +64,7 @@ class OfflineHost:
         heads = [head.data.cast("B").cast("q") for head in self._room.heads]
         self._blocks = [Block(head, self._room, slot) for slot, head in enumerate(heads)]
         self._claimed = self._first = self._answered = 0
+        self._exchanging, self._seen = False, -1
         self._on_batch, self._on_event, self._stop = on_batch, on_event, stop
 
     def claim(self, *, due: bool = True) -> Block:
@@ -69,13 +72,24 @@ class OfflineHost:
         block = self._blocks[self._claimed % len(self._blocks)]
         block.number, block.due = self._claimed if due else -1, due
         self._claimed += 1
+        self._exchanging = False
         return block
 
     def sending(self, block: Block) -> None:
-        """Do nothing: blocks do not survive this process."""
+        """Note that an exchange begins."""
+        self._exchanging = True
+
+    def check_exchange(self) -> None:
+        """Raise TimeoutError if the same exchange was active at the last call."""
+        if self._exchanging and self._seen == self._claimed:
+            # Time passes for the attempts to set the safe value, too.
+            self.clock.sleep_until_ns(self.clock.now_ns() + round(PATIENCE_S * 1e9))
+            raise TimeoutError(f"it has not returned within {PATIENCE_S:g} s")
+        self._seen = self._claimed
 
     def answered(self, block: Block) -> bool:
         """Collect a block."""
+        self._exchanging = False
         self._answered = block.number + 1
         if self._answered - self._first == _BLOCKS_A_BATCH:
             self.flush()
@@ -167,7 +181,7 @@ def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, L
         loop, waveform_at = _opened(plan, loaded.device, host, loaded.config.safe.at_start)
         recorder.begin(time.time_ns(), {"paced": "false"}, waveform_at)
     except HilctlError:
-        loaded.device.close()
+        _closed(loaded.device)
         recorder.discard()
         raise
     return _drive(loop, loaded.device, host)
@@ -189,18 +203,32 @@ def _opened(
 ) -> tuple[Loop, int]:
     """Open the device; return the loop, and the number of samples before the waveform."""
     loop = Loop(plan, device, host)
-    device.open(plan.sample_rate_hz, plan.block)
-    try:
-        return loop, loop.begin_at(starting_output(device, at_start))
-    except HilctlError:
-        device.close()
-        raise
+    with time_limit():
+        device.open(plan.sample_rate_hz, plan.block)
+        try:
+            return loop, loop.begin_at(starting_output(device, at_start))
+        except HilctlError:
+            _closed(device)
+            raise
 
 
 def _drive(loop: Loop, device: Device, host: OfflineHost) -> tuple[LoopOutcome, Lateness]:
     try:
-        outcome = loop.run(0)
+        with alarm(host.check_exchange, PATIENCE_S):
+            outcome = loop.run(0)
     finally:
-        device.close()
+        failed = _closed(device)
         host.flush()
+    if failed:
+        outcome = replace(outcome, code="fault", reason=f"{outcome.reason}; then {failed}")
     return outcome, loop.lateness
+
+
+def _closed(device: Device) -> str:
+    """Close a device; return why that failed, or an empty text."""
+    try:
+        with time_limit():
+            device.close()
+    except DeviceError as error:
+        return str(error)
+    return ""

@@ -4,11 +4,10 @@ import json
 import os
 import subprocess
 import sys
-from typing import NamedTuple
 
 import pytest
 
-from hilctl import cli
+from tests.commands import Ended, in_process
 
 GOOD = """\
 name: tiny
@@ -32,14 +31,6 @@ IN_UM = GOOD.replace("unit: A", "unit: um").replace(
 )
 
 
-class Ended(NamedTuple):
-    """How a command ended."""
-
-    code: int
-    out: str
-    err: str
-
-
 def contents(folder):
     return {
         path: path.read_bytes() if path.is_file() else None for path in sorted(folder.rglob("*"))
@@ -60,14 +51,7 @@ def place(tmp_path, monkeypatch):
 
 @pytest.fixture
 def hilctl(monkeypatch, capsys):
-    def run(*words):
-        monkeypatch.setattr(sys, "argv", ["hilctl", *map(str, words)])
-        with pytest.raises(SystemExit) as ended:
-            cli.main()
-        assert isinstance(ended.value.code, int)
-        return Ended(ended.value.code, *capsys.readouterr())
-
-    return run
+    return in_process(monkeypatch, capsys)
 
 
 def check_refused(ended, message):

@@ -1,13 +1,10 @@
 """A third-party device package: installed, listed and run with public names only."""
 
 import ast
-import configparser
 import importlib
 import json
-import os
 import subprocess
 import sys
-import tomllib
 from pathlib import Path
 
 import numpy as np
@@ -16,6 +13,7 @@ import yaml
 
 from hilctl.analysis.replay import replay
 from hilctl.recording.reader import read
+from tests import device_packages
 
 SOURCE = Path(__file__).parents[1] / "data" / "own_device"
 PUBLIC = {"Device", "DeviceError", "DeviceInfo", "DeviceOptions"}
@@ -33,23 +31,7 @@ EXPERIMENT = {
 
 @pytest.fixture
 def installed(tmp_path):
-    """The environment of an installation of the package.
-
-    The files are written from the package's project file, because building it needs a network.
-    """
-    project = tomllib.loads((SOURCE / "pyproject.toml").read_text(encoding="utf-8"))["project"]
-    site = tmp_path / "site"
-    facts = site / f"{project['name'].replace('-', '_')}-{project['version']}.dist-info"
-    facts.mkdir(parents=True)
-    (site / "own_device").symlink_to(SOURCE / "own_device")
-    name, version = project["name"], project["version"]
-    (facts / "METADATA").write_text(f"Metadata-Version: 2.1\nName: {name}\nVersion: {version}\n")
-    points = configparser.ConfigParser()
-    points.read_dict(project["entry-points"])
-    with (facts / "entry_points.txt").open("w") as file:
-        points.write(file)
-    before = os.environ.get("PYTHONPATH", "")
-    return {**os.environ, "PYTHONPATH": os.pathsep.join(filter(None, (str(site), before)))}
+    return device_packages.installed("own_device", tmp_path / "site")
 
 
 def hilctl(environment, *words):

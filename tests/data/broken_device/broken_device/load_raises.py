@@ -1,0 +1,5 @@
+"""A module that never loads."""
+
+from broken_device.device import fail
+
+fail("raises")

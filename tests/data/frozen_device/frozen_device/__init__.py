@@ -1,0 +1,1 @@
+"""A device written for hilctl 0.2.0."""
