@@ -253,10 +253,12 @@ class IlcSession:
 
     def _judge(self, number: int, path: Path, *, learning: bool) -> list[IlcRow]:
         recording = read(path)
+        # Samples before the waveform: a ramp, a condition, a rest.
+        before = recording.segments[0].start - self._checked.reference.segments[0].start
         rows = []
         for i, segment in enumerate(self._segments):
             state = self._learning[i]
-            error = cycle_error(recording, segment, state.highest_hz)
+            error = cycle_error(recording, segment.shifted(before), state.highest_hz)
             reach_hz = state.reach_hz
             if learning and not state.done:
                 state = learn(state, error)

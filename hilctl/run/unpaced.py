@@ -188,14 +188,15 @@ def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, L
 
 
 def run_in_memory(plan: LoopPlan, device: Device) -> tuple[LoopOutcome, Samples]:
-    """Run a plan on a simulated device; return the outcome and the samples."""
+    """Run a plan on a simulated device; return the outcome and the samples from the waveform on."""
     parts: list[Samples] = []
     host = OfflineHost(plan, on_batch=lambda batch: parts.append(batch.samples(slice(None))))
-    loop, _ = _opened(plan, device, host, None)
+    loop, waveform_at = _opened(plan, device, host, None)
     outcome, _ = _drive(loop, device, host)
     values = np.concatenate([[*part.columns().values()] for part in parts], axis=1)
     index = np.concatenate([part.index for part in parts])
-    return outcome, Samples.of(index, values, np.concatenate([part.flags for part in parts]))
+    samples = Samples.of(index, values, np.concatenate([part.flags for part in parts]))
+    return outcome, samples.rows(index >= waveform_at)
 
 
 def _opened(

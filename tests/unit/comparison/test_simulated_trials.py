@@ -32,8 +32,8 @@ SINE = Sine(
 CHIRP = Chirp(kind="chirp", unit="um", amplitude=1.0, start_hz=1.0, stop_hz=10.0, duration_s=1.0)
 
 
-def device(*waveforms):
-    return simulated_trials.TrialDevice(resolve(Document("stage.yaml", TEXT), CONFIGS), waveforms)
+def device(*waveforms, text=TEXT):
+    return simulated_trials.TrialDevice(resolve(Document("stage.yaml", text), CONFIGS), waveforms)
 
 
 def line(slope):
@@ -57,6 +57,15 @@ def test_trials_start_from_rest():
     first = rig.run(piezo_ppi(), rig.references[0])
     rig.run(line(0.3), rig.references[0])
     assert rig.run(piezo_ppi(), rig.references[0]) == first
+
+
+def test_a_ramp_from_elsewhere_is_not_evaluated():
+    elsewhere = TEXT.replace("simulated_piezo", "simulated_piezo, output_at_open: 30.0")
+    trials = [
+        (rig := device(SINE, text=text)).run(piezo_ppi(), rig.references[0])[0]
+        for text in (TEXT, elsewhere)
+    ]
+    assert trials[1].peak_error_percent == pytest.approx(trials[0].peak_error_percent, rel=0.1)
 
 
 def test_the_limiter_is_between():

@@ -6,6 +6,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl.analysis.report import summarize
 from hilctl.base.errors import ConfigError, InputError, RunError
 from hilctl.base.segments import Segment
 from hilctl.experiment.correction import Correction, LearnedCycle, load_correction
@@ -59,6 +60,18 @@ def test_each_run_has_the_next_correction_and_noise_of_its_own(tmp_path):
     assert [row.run for row in found.check] == [3]
     assert "2 learning cycles" in found.reason
     assert found.rows[1].error_percent < found.rows[0].error_percent
+
+
+@pytest.mark.parametrize("before", [
+    "condition={cycles: 3, frequency_hz: 50, rest_s: 0.0123}",
+    "compensator.offset=measured",
+    "device.output_at_open=3.3",
+])  # fmt: skip
+def test_samples_before_the_waveform_are_not_evaluated(tmp_path, before):
+    settings = [*SETTINGS, before]
+    (row,) = IlcSession(SINE, settings, tmp_path, Runs(1)).learn(1, lambda rows: None).rows
+    report = summarize(read(Path(row.recording)))
+    assert row.error_percent == pytest.approx(report.peak_error_percent)
 
 
 def test_a_run_that_is_stopped_leaves_what_was_learned(tmp_path):
