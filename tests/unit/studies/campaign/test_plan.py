@@ -77,6 +77,6 @@ def test_a_calibration_is_no_obstacle(campaign, tmp_path):
 
 def test_heat_of_the_last_run_is_no_error(campaign, tmp_path, monkeypatch):
     """It causes a pause."""
-    monkeypatch.setattr("hilctl.experiment.preflight.heat_before", lambda loaded, now_s: 0.48)
+    monkeypatch.setattr("hilctl.experiment.preflight.heat_before", lambda loaded, now: (0.48, ()))
     plan = planned(campaign(CAMPAIGN + HOT), tmp_path, {}, 0.48)
     assert plan.steps[0].pause_s > 0.0
