@@ -2,9 +2,11 @@
 
 import json
 import os
+import random
 import subprocess
 import sys
 import tempfile
+import time
 from pathlib import Path
 
 import pytest
@@ -21,6 +23,9 @@ PATIENT = {
 }
 
 
+TRIALS = 20
+
+
 class Neighbour:
     """Another user with a separate folder."""
 
@@ -29,10 +34,10 @@ class Neighbour:
         text = yaml.safe_dump({**EXPERIMENT, **PATIENT, "device": section})
         (folder / "theirs.yaml").write_text(text, encoding="utf-8")
 
-    def start(self):
+    def start(self, *more):
         command = [sys.executable, "-P", "-m", "hilctl", "run", "theirs.yaml", "--json"]
         self.process = subprocess.Popen(
-            [*self._words, *command, "--output", "theirs.mcap"],
+            [*self._words, *command, "--output", "theirs.mcap", *more],
             cwd=self.folder,
             stdout=subprocess.PIPE,
             stderr=subprocess.PIPE,
@@ -118,3 +123,22 @@ def test_a_user_who_only_takes_the_name_keeps_nobody_from_the_safe_value(
         hilctl("run", path, "--take-over", *short)
     finally:
         squatter.communicate("\n", timeout=60)
+
+
+@pytest.mark.long
+def test_of_two_users_with_two_names_of_a_device_one_is_refused(neighbour, device, run):
+    chance = random.Random(TRIALS)
+    for trial in range(TRIALS):
+        theirs = neighbour.start("--set", "device.host=localhost", "--overwrite")
+        time.sleep(chance.uniform(0.0, 0.5))
+        mine = run(device.section, name=f"mine{trial}", **PATIENT).process
+        deadline = time.monotonic() + 60.0
+        while theirs.poll() is None and mine.poll() is None:
+            assert time.monotonic() < deadline, "both run"
+            time.sleep(0.02)
+        refused, other = (mine, theirs) if theirs.poll() is None else (theirs, mine)
+        assert refused.communicate()[1].count("in use by") == 1
+        assert refused.returncode == 2
+        other.terminate()
+        out, err = other.communicate(timeout=60)
+        assert json.loads(out)["output_safe"], err
