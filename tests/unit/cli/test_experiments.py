@@ -37,7 +37,7 @@ def runs(tmp_path, monkeypatch):
     """Replace runs by copies of a golden recording; return their arguments and result."""
     seen, ends = [], {"code": "completed", "stop_signal": 0}
 
-    def start_run(experiment, settings, output, overwrite, on_progress):
+    def start_run(experiment, settings, output, overwrite, on_progress, *, take_over):
         path = tmp_path / f"{len(seen)}.mcap"
         path.write_bytes(GOLDEN.read_bytes())
         seen.append((experiment.name, settings))

@@ -21,6 +21,7 @@ from hilctl.cli.reports import render_report
 from hilctl.cli.run import print_run, report_of, run_mapping, run_progress
 from hilctl.run.result import RunResult
 from hilctl.run.safety.manual_safe import SafeResult
+from hilctl.run.start import Detached
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 ENDED = RunResult(Path("a.mcap"), "stopped", "hilctl stop", "confirmed", 15, 0, 3, 2)
@@ -31,8 +32,8 @@ def started(monkeypatch):
     """Replace runs; return the arguments of their start, and the fields of their result."""
     asked, ends = [], {"code": "completed", "stop_signal": 0}
 
-    def start_run(experiment, settings, output, overwrite, on_progress):
-        asked.append((experiment, settings, output, overwrite))
+    def start_run(experiment, settings, output, overwrite, on_progress, *, take_over):
+        asked.append((experiment, settings, output, overwrite, take_over))
         return replace(ENDED, **ends)
 
     monkeypatch.setattr("hilctl.api.runs.start_run", start_run)
@@ -68,8 +69,23 @@ def test_interrupted_report_keeps_the_result(started, hilctl, monkeypatch):
 
 def test_require_rt_is_the_last_setting(started, json_of):
     _, result = json_of("run", DEMO, "--require-rt", "--set", "block=25")
-    assert started[0] == [(DEMO, ["block=25", "realtime.require=true"], None, False)]
+    assert started[0] == [(DEMO, ["block=25", "realtime.require=true"], None, False, False)]
     assert result["code"] == "completed"
+
+
+def test_a_device_of_another_user_is_taken_over_on_request_only(started, json_of, monkeypatch):
+    json_of("run", DEMO, "--take-over")
+    assert started[0][0][-1] is True
+    flags = []
+
+    def start_detached(experiment, settings, output, given):
+        flags.append(given)
+        return Detached(None, Path("a.mcap"), Path("a.log"))
+
+    monkeypatch.setattr(module, "start_detached", start_detached)
+    json_of("run", DEMO, "--detach", "--take-over", "--overwrite")
+    json_of("run", DEMO, "--detach")
+    assert flags == [["--overwrite", "--take-over"], []]
 
 
 def test_check_prints_the_forecast(json_of):

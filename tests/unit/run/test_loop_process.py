@@ -28,7 +28,7 @@ from hilctl.machine.rt_setup import SetUpStep
 from hilctl.run import loop_process
 from hilctl.run.job import Job
 from hilctl.run.loop_process import RingHost
-from hilctl.run.run_folder import RunCard, RunFolder
+from hilctl.run.run_folder import GUARDIAN, RunCard, RunFolder
 from hilctl.run.shared import ring as ring_module
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, Stop
@@ -71,8 +71,9 @@ class Prepared:
             folder.ring, slots=16, block=50, state_size=checked.state_size
         )
         self.page = self.ring.page
+        self.page.put(PageField.HAS_DEVICE, 1)
         self.page.put(PageField.GO, 1)
-        self.job = Job.of(checked, folder, supervisor=os.getppid(), silence_s=1.0)
+        self.job = Job.of(checked, folder, locks=[], supervisor=os.getppid(), silence_s=1.0)
         self.device = Closing(checked.loaded.device.info, **device_is)
         self.loaded = replace(checked.loaded, device=self.device)
         self._patch = monkeypatch
@@ -185,41 +186,82 @@ def test_real_time_that_is_required_is_refused_before_the_device_is_opened(prepa
     assert made.device.events == ["prepare"]
 
 
-class Waiting:
-    """Time that the loop lets pass while it waits for the start signal."""
-
-    def __init__(self, made, supervised=True):
-        self.made, self.supervised, self.slept_s = made, supervised, []
-
-    def sleep(self, seconds):
-        assert self.made.page.get(PageField.PHASE) == Phase.READY
-        self.slept_s.append(seconds)
-        if len(self.slept_s) == 3:
-            self.made.page.put(PageField.GO, 1)
-
-    def __getattr__(self, name):
-        return getattr(time, name)
-
-
-def test_it_waits_for_the_start_signal(prepared, monkeypatch):
-    made = prepared()
-    made.page.put(PageField.GO, 0)
+@pytest.mark.parametrize(("field", "done"), [
+    (PageField.HAS_DEVICE, ["prepare"]),
+    (PageField.GO, ["prepare", "open"]),
+])  # fmt: skip
+def test_it_waits_for_the_device_and_the_start_signal(prepared, monkeypatch, field, done):
+    """A guardian may keep the device until the loop needs it."""
+    made, slept_s = prepared(), []
+    made.page.put(field, 0)
     made.loop_does(lambda loop, start_ns: OUTCOME)
-    waiting = Waiting(made)
-    monkeypatch.setattr(loop_process, "time", waiting)
+
+    def sleep(seconds):
+        slept_s.append(seconds)
+        assert made.page.get(PageField.AWAITS_DEVICE)
+        assert made.device.events == done
+        made.page.put(field, len(slept_s) == 3)
+
+    monkeypatch.setattr(time, "sleep", sleep)
     assert made.run() == OUTCOME
-    assert len(waiting.slept_s) == 3
-    assert max(waiting.slept_s) < 0.005
+    assert len(slept_s) == 3
+    assert max(slept_s) < 0.005
 
 
-def test_if_the_supervisor_dies_before_the_start_nothing_moves(prepared, monkeypatch):
+@pytest.mark.parametrize(("field", "done"), [
+    (PageField.HAS_DEVICE, ["prepare"]),
+    (PageField.GO, ["prepare", "open", "close"]),
+])  # fmt: skip
+def test_if_the_supervisor_dies_before_the_start_nothing_moves(prepared, monkeypatch, field, done):
     """There is no recording that could say so; the output stays where it was found."""
     made = prepared()
-    made.page.put(PageField.GO, 0)
+    made.page.put(field, 0)
     monkeypatch.setattr("hilctl.run.loop_process.RingHost.supervised", lambda host: False)
     with pytest.raises(RunError, match="nothing has moved"):
         made.run()
-    assert made.device.events == ["prepare", "open", "close"]
+    assert made.device.events == done
+
+
+@pytest.fixture
+def orphaned(prepared, monkeypatch):
+    """A loop of a real device whose supervisor is dead; return the job, and words of a new program.
+
+    Its guardian gave its last heartbeat 2 s ago.
+    """
+    made, words = prepared(), []
+    made.job = replace(made.job, holds=["tcp:10.9.8.7"], supervisor=1 - os.getppid())
+    made.page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns() - 2 * 10**9)
+    made.job.write(made.folder.job)
+    monkeypatch.setattr(loop_process.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(loop_process, "be_ordinary", lambda: None)
+    monkeypatch.setattr(loop_process, "keep_removed", lambda: None)
+    monkeypatch.setattr(loop_process.os, "execv", lambda program, given: words.append(given))
+    made.words = words
+
+    def ends(outcome):
+        monkeypatch.setattr(loop_process, "run_job", lambda job, ring: outcome)
+        loop_process.main([str(made.folder.job)])
+
+    made.ends = ends
+    return made
+
+
+def test_the_last_process_of_a_run_becomes_its_guardian(orphaned):
+    orphaned.ends(replace(OUTCOME, output="unknown"))
+    ((*_, module, job, how),) = orphaned.words
+    assert (module, job, how) == (GUARDIAN, str(orphaned.folder.job), "act")
+
+
+@pytest.mark.parametrize("why", ["safe", "guarded", "not started", "simulated"])
+def test_a_loop_ends_if_its_output_needs_no_guardian(orphaned, why):
+    if why == "guarded":
+        orphaned.page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns() + 10**12)
+    elif why == "not started":
+        orphaned.page.put(PageField.GO, 0)
+    elif why == "simulated":
+        replace(orphaned.job, holds=[]).write(orphaned.folder.job)
+    orphaned.ends(OUTCOME if why == "safe" else replace(OUTCOME, output="unknown"))
+    assert orphaned.words == []
 
 
 def test_it_leaves_what_the_run_took_of_the_machine(prepared, monkeypatch):

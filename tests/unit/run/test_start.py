@@ -114,7 +114,7 @@ def test_no_log_takes_the_place_of_another_file(tmp_path):
     assert unused(log, ".") == tmp_path / "run.3.log"
 
 
-GIVEN = ("x.yaml", (), None, False, 0.0)
+GIVEN = ("x.yaml", (), None, False, 0.0, False)
 
 
 @pytest.fixture

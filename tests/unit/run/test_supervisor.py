@@ -1,6 +1,6 @@
-"""The order in which a run is begun, what is given back where it can't be, and what is said of it.
+"""The supervisor: the start of a run, what a failed start leaves, and the result of a run.
 
-All neighbours are doubles that note what is asked of them; whole runs are in ``tests/faults``.
+Processes, recording and monitor are doubles; complete runs are in ``tests/faults``.
 """
 
 import json
@@ -20,25 +20,14 @@ from hilctl.loop.pacer import Lateness
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run import supervisor as module
 from hilctl.run.control.client import STOP_SIGNAL
+from hilctl.run.run_folder import held_devices, run_folder, runs
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot, SafeActionResult, Stop
 from hilctl.run.supervisor import ProgressThread, RunMonitor, Supervisor, SystemdNotifier
 from tests.fakes import SteppingClock
 
 MS = 1_000_000
-STARTED = [
-    "ordinary",
-    "devices",
-    "claimed",
-    "folder",
-    "server",
-    "job.json",
-    "description.json",
-    "child",
-    "guardian",
-]
-READY = [*STARTED, "await ready", "begin", "favoured", "recording"]
-UNDONE = ["ordinary again", "server closed", "folder removed", "devices let go"]
+HOLDS = f"tcp:10.9.8.7:{os.getpid()}"  # locks are the whole machine's
 
 
 class Time:
@@ -56,16 +45,22 @@ class Time:
 
 
 class Neighbours:
-    """All that the supervisor works with."""
+    """Doubles of the processes, the recording and the monitor of a run.
+
+    Attributes:
+        fails: Error by name of a step.
+        open: What was started and not ended.
+    """
 
     def __init__(self, folder, patch):
-        self.log, self.fails, self.begun = [], {}, []
+        self.fails, self.open, self.begun = {}, set(), []
         self.time, self.begin_takes_ns = Time(), [0]
         self.guardian_looks, self.attended, self.on_attend = 2, [], {}
-        self.refused = []
-        self.ring = None
+        self.refused, self.said, self.broken_off = [], [], []
+        self.ring = self.guardian = None
+        self.guarded = False
         self.info = SimpleNamespace(
-            simulated=False, holds=("tcp:here",), latency_blocks=0, arm_s=0.0, aux=()
+            simulated=False, holds=(HOLDS,), latency_blocks=0, arm_s=0.0, aux=()
         )
         self.config = SimpleNamespace(
             trigger=None,
@@ -81,103 +76,78 @@ class Neighbours:
         self.output = folder / "run.mcap"
         self.recorder = SimpleNamespace(
             path=self.output, samples=95, missing=5, error="", adapted={},
-            begin=self.begin, discard=lambda: self.note("given back"),
+            begin=self.begin, discard=lambda: self.open.remove("recorder"),
         )  # fmt: skip
-        self.outcome, self.broke = (
-            LoopOutcome("completed", "waveform completed", 100, "confirmed", 0),
-            "",
-        )
-        self.folder = SimpleNamespace(
-            path=folder, ring=folder / "ring", socket=folder / "socket",
-            description=folder / "description.json", job=folder / "job.json",
-            keep=lambda: self.note("folder kept"),
-        )  # fmt: skip
-        self.folder.description.touch()
-        self.said, self.resumed, self.kept = [], [], False
+        self.outcome = LoopOutcome("completed", "waveform completed", 100, "confirmed", 0)
+        self.broke, self.unsafe = "", False
         for name, double in {
             "time": self.time,
-            "be_ordinary": lambda: self.note("ordinary"),
-            "favoured": lambda loop: self.around("favoured", "ordinary again", loop),
-            "held_devices": lambda holds: self.around("devices", "devices let go", [*holds]),
-            "Recorder": lambda *a, overwrite: self.note("claimed", self.recorder),
-            "run_folder": self.run_folder,
+            "be_ordinary": lambda: None,
+            "favoured": lambda loop: self.around("favoured"),
+            "Recorder": lambda *a, overwrite: self.step("recorder", self.recorder, opens=True),
             "Requests": lambda *a: SimpleNamespace(answer=None),
-            "ControlServer": self.server,
+            "ControlServer": lambda *a: self.around(
+                "server", SimpleNamespace(start=lambda: self.step("serving"))
+            ),
             "LoopProcess": self.child,
             "Job": SimpleNamespace(of=self.job),
             "RunDescription": SimpleNamespace(
-                of=lambda checked: SimpleNamespace(write=self.written)
+                of=lambda checked: SimpleNamespace(write=lambda path: path.touch())
             ),
             "RingRecorder": self.ring_recorder,
-            "GuardianProcess": lambda folder, page, inherits, loop: self.note("guardian", inherits),
-            "GuardianRelief": lambda holds: SimpleNamespace(
-                resume=self.resumed.append, discard=lambda: self.resumed.append("discarded")
-            ),
+            "GuardianProcess": self.start_guardian,
             "SafetyMonitor": self.safety,
             "RunMonitor": self.started_run,
-            "ProgressThread": lambda *a: SimpleNamespace(
-                start=lambda: self.said.append("shown"), end=lambda: self.note("progress ended")
-            ),
+            "ProgressThread": lambda *a: SimpleNamespace(start=lambda: None, end=lambda: None),
             "SystemdNotifier": lambda: SimpleNamespace(
-                say=lambda *lines: self.said.extend(lines), alive=lambda: self.said.append("alive")
+                say=lambda *lines: self.said.extend(lines), alive=lambda: None
             ),
         }.items():
             patch.setattr(module, name, double)
 
-    def note(self, what, value=None):
-        self.log.append(what)
+    def step(self, what, value=None, *, opens=False):
         if what in self.fails:
             raise self.fails[what]
+        if opens:
+            self.open.add(what)
         return value
 
     @contextmanager
-    def around(self, what, afterwards, value):
-        self.note(what)
+    def around(self, what, value=None):
+        self.step(what, opens=True)
         try:
             yield value
         finally:
-            self.log.append(afterwards)
+            self.open.remove(what)
 
-    def run_folder(self, name, output, started, holds):
-        assert (name, output, started, holds) == ("stage", self.output, 5.0, ("tcp:here",))
-        return self.around("folder", "folder removed", (self.folder, ["lock"]))
-
-    @contextmanager
-    def server(self, socket, answer):
-        assert socket == self.folder.socket
-        with self.around("server", "server closed", None):
-            yield SimpleNamespace(start=lambda: self.note("serving"))
-
-    def job(self, checked, folder, *, supervisor, silence_s):
+    def job(self, checked, folder, *, locks, supervisor, silence_s):
         assert supervisor == os.getpid()
-        self.silence_s = silence_s
-        return SimpleNamespace(write=self.written)
-
-    def written(self, path):
-        self.note(path.name)
+        self.locks, self.silence_s = locks, silence_s
+        return SimpleNamespace(write=lambda path: path.touch())
 
     def child(self, folder, page, inherits):
-        assert inherits == ["tcp:here", "lock"]
+        assert set(self.locks) < set(inherits)
         set_up = json.dumps([{"rt.fifo": "done: 50"}, self.refused])
         page.write_text(PageSlot.SET_UP, set_up)
         page.put(PageField.WAVEFORM_AT, 40)
-        self.note("child")
+        self.step("child", opens=True)
         return SimpleNamespace(
-            pid=1, await_ready=self.await_ready, kill=lambda: self.note("child killed")
+            pid=1, await_ready=self.await_ready, kill=lambda: self.open.remove("child")
         )
 
-    def await_ready(self, stopped):
+    def await_ready(self, stopped, acquire):
         assert not stopped()
         if "signal before the start" in self.fails:
             os.kill(os.getpid(), signal.SIGTERM)
             assert stopped()
-        self.note("await ready")
+        acquire()
+        self.step("await ready")
 
     def begin(self, start_unix_ns, set_up, waveform_at):
         assert (set_up, waveform_at) == ({"rt.fifo": "done: 50"}, 40)
         self.begun.append((start_unix_ns, self.time.now_ns))
         self.time.now_ns += self.begin_takes_ns.pop(0) if self.begin_takes_ns else 0
-        self.note("begin")
+        self.step("begin")
         if "signal while it begins" in self.fails:
             os.kill(os.getpid(), signal.SIGTERM)
 
@@ -187,25 +157,34 @@ class Neighbours:
 
     def start(self, *_):
         assert self.ring.page.get(PageField.GO) == 0
-        self.note("recording")
+        self.step("recording")
+
+    def start_guardian(self, folder, page, inherits, loop):
+        self.step("guardian")
+        self.guardian = inherits
 
     def safety(self, checked, ring, child, guardian, record_event):
-        self.guardian = guardian and guardian(child.pid)
-        return SimpleNamespace(
-            ready=self.ready, close=lambda stopped=None: self.note("safety closed", self.kept)
-        )
+        if guardian is not None:
+            guardian(child.pid)
+        self.open.add("safety")
+        return SimpleNamespace(ready=self.ready, close=self.close_safety)
 
     def ready(self):
         self.guardian_looks -= 1
         return self.guardian_looks < 0
+
+    def close_safety(self, stopped=None):
+        self.open.remove("safety")
+        return self.guarded
 
     def started_run(self, checked, ring, child, safety, recording):
         return SimpleNamespace(
             poll=self.attend,
             progress=None,
             progress_failed=None,
-            break_off=lambda error: self.note(f"broken off: {error}"),
+            break_off=lambda error: self.broken_off.append(str(error)),
             outcome=self.outcome,
+            unsafe=self.unsafe,
             broke=self.broke,
         )
 
@@ -229,25 +208,50 @@ def stage(tmp_path, monkeypatch):
         signal.signal(number, handler)
 
 
-def test_a_run_is_begun_in_one_order_and_undone_in_the_other(stage):
+@pytest.fixture
+def earlier(tmp_path):
+    """Page of an earlier run of the device, whose processes ended before its output was safe."""
+    with run_folder("earlier", tmp_path / "earlier.mcap", 1.0, (HOLDS,)) as (folder, _):
+        page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+        page.put(PageField.RECORDED, 1)
+        folder.keep(recorded=True)
+    return page
+
+
+def test_a_completed_run(stage):
+    held = []
+
+    def look():
+        with pytest.raises(InputError, match="in use by"), held_devices([HOLDS]):
+            pass
+        held.append([run.card.name for run in runs()])
+
+    stage.on_attend[1] = look
     result = stage.run()
-    assert stage.log == [*READY, "serving", "progress ended", "safety closed", *UNDONE]
     page = stage.ring.page
-    assert page.get(PageField.GO) == 1
-    assert stage.guardian_looks == -1  # it was waited for, and not a moment longer
     ((unix_ns, at_ns),) = stage.begun
     assert 10**12 < at_ns <= 10**12 + 20 * MS
     assert page.get(PageField.START_NS) == at_ns + 50 * MS
     assert unix_ns - 10**18 == page.get(PageField.START_NS)
     assert page.get(PageField.SUPERVISOR_HEARTBEAT_NS) == at_ns
-    assert stage.guardian == ["tcp:here", "lock"]
+    assert set(stage.locks) < set(stage.guardian)
     assert (result.path, result.code, result.reason) == (
         stage.output, "completed", "waveform completed",
     )  # fmt: skip
     assert (result.samples, result.missing, result.safe, result.stop_signal) == (95, 5, True, 0)
-    ready = ["shown", "READY=1", f"STATUS=recording to {stage.output}"]
-    assert stage.said == [*ready, *["alive"] * 3, "STOPPING=1"]
-    assert stage.resumed == ["discarded"]  # the guardian of an earlier run
+    assert stage.said == ["READY=1", f"STATUS=recording to {stage.output}", "STOPPING=1"]
+    assert held == [[f"stage-{os.getpid()}"]]
+    assert runs() == []
+    with held_devices([HOLDS]):
+        pass
+
+
+def test_a_guardian_of_an_earlier_run_is_relieved_by_the_start_signal(stage, earlier):
+    stage.on_attend[1] = lambda: relieved.append(earlier.get(PageField.RELIEVED))
+    relieved = []
+    stage.run()
+    assert relieved == [1]
+    assert runs() == []
 
 
 def test_a_guardian_that_does_not_get_ready_is_not_waited_for(stage):
@@ -264,54 +268,36 @@ def test_a_supervisor_that_breaks_again_and_again_still_sees_to_the_run(stage):
     stage.on_attend = {1: broken, 2: broken, 3: broken}
     stage.run()
     assert stage.attended == [0] * 4
-    assert stage.log.count("broken off: a bug") == 3
+    assert stage.broken_off == ["a bug"] * 3
 
 
 def test_a_simulated_device_has_no_guardian(stage):
     stage.info.simulated = True
     stage.run()
     assert stage.guardian is None
-    assert "guardian" not in stage.log
 
 
-def test_signals_are_taken_for_as_long_as_anything_is_begun_or_undone(stage):
-    """One that came while the last process is ended would cost the result of the run."""
-    before, taken = signal.getsignal(signal.SIGINT), {}
-
-    class Log(list):
-        def append(self, what):
-            taken[what] = signal.getsignal(signal.SIGINT) is not before
-            super().append(what)
-
-    stage.log = Log()
-    stage.run()
-    assert {"devices", "devices let go"} < taken.keys()
-    assert [what for what, held in taken.items() if not held] == ["ordinary"]
-    assert signal.getsignal(signal.SIGINT) is before
-
-
-@pytest.mark.parametrize("number", range(len(READY)))
-def test_whatever_fails_before_the_start_signal_leaves_nothing(stage, number):
-    what = READY[number]
+@pytest.mark.parametrize("what", [
+    "recorder", "server", "child", "guardian", "await ready", "begin", "favoured", "recording",
+])  # fmt: skip
+def test_a_failed_start_leaves_nothing(stage, earlier, what):
+    """Except the guardian of an earlier run, which continues."""
     stage.fails[what] = InputError("that")
     with pytest.raises(InputError, match="that"):
         stage.run()
-    done = stage.log[: number + 1]
-    assert done == READY[: number + 1]
-    expected = []
-    if number > READY.index("child"):
-        expected.append("child killed")
-    if number > READY.index("guardian"):
-        expected.append("safety closed")
-    if number > READY.index("claimed"):
-        expected.append("given back")
-    undo = dict(zip(("favoured", "server", "folder", "devices"), UNDONE, strict=True))
-    expected += [undone for begun, undone in undo.items() if READY.index(begun) < number]
-    assert stage.log[number + 1 :] == expected
-    locks = ["tcp:here"] if number > READY.index("devices") else []
-    assert stage.resumed == [locks] * (number > 0)  # the guardian of an earlier run
-    if stage.ring is not None:
-        assert stage.ring.page.get(PageField.GO) == 0
+    assert stage.open == set()
+    assert [run.card.experiment for run in runs()] == ["earlier"]
+    assert earlier.get(PageField.RELIEVED) == 0
+    assert stage.ring is None or stage.ring.page.get(PageField.GO) == 0
+    with held_devices([HOLDS]):
+        pass
+
+
+def test_a_run_of_a_device_in_use_touches_no_file(stage):
+    stage.fails["recorder"] = AssertionError("the recording was opened")
+    with held_devices([HOLDS]), pytest.raises(InputError, match=f"{HOLDS} is in use by"):
+        stage.run()
+    assert runs() == []
 
 
 def test_what_the_system_refuses_at_the_start_is_a_message(stage):
@@ -329,10 +315,10 @@ def test_a_signal_before_the_start_is_seen(stage):
 
 def test_a_signal_just_before_the_start_signal_is_seen(stage):
     stage.fails["signal while it begins"] = True
+    stage.fails["recording"] = AssertionError("the recording was started")
     with pytest.raises(RunError, match="stopped before the start"):
         stage.run()
-    assert "recording" not in stage.log
-    assert {"child killed", "safety closed", "given back"} <= set(stage.log)
+    assert stage.open == set()
     assert stage.ring.page.get(PageField.GO) == 0
 
 
@@ -366,10 +352,8 @@ def test_what_breaks_afterwards_costs_neither_coil_nor_recording(stage):
     stage.run()
     assert stage.attended == [0] * 4
     assert list(np.diff(at_ns)) == [10 * MS] * 3  # not as fast as it can
-    assert stage.log[len(READY) :][:3] == [
-        "serving", "broken off: a bug", "progress ended",
-    ]  # fmt: skip
-    assert stage.log[-5:] == ["safety closed", *UNDONE]
+    assert stage.broken_off == ["a bug"]
+    assert "safety" not in stage.open
 
 
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM, signal.SIGHUP, STOP_SIGNAL])
@@ -429,15 +413,28 @@ def test_how_it_ended(stage, changes, code, reason):
     assert result.safe == stage.outcome.safe
 
 
-@pytest.mark.parametrize(("error", "guarded"), [("no room", False), ("", True)])
-def test_the_folder_is_kept_for_samples_that_the_file_lacks_or_a_guardian(stage, error, guarded):
-    stage.recorder.error, stage.kept = error, guarded
+@pytest.mark.parametrize(("error", "guarded", "unsafe"), [
+    ("no room", False, False),
+    ("", True, True),
+    ("", False, True),
+])  # fmt: skip
+def test_the_folder_is_kept_for_samples_that_the_file_lacks_or_an_unsafe_output(
+    stage, error, guarded, unsafe
+):
+    stage.recorder.error, stage.guarded, stage.unsafe = error, guarded, unsafe
     result = stage.run()
+    (left,) = runs()
+    assert (left.alive, left.recorded) == (False, not error)
     assert result.guardian_active == guarded
     assert (result.code == "fault") == bool(error)
     assert error in result.reason
-    assert (str(stage.folder.path) in result.reason) == bool(error)
-    assert stage.log.index("folder kept") < stage.log.index("folder removed")
+    assert (str(left.path) in result.reason) == bool(error)
+
+
+def test_a_simulated_device_needs_no_attention_after_its_run(stage):
+    stage.info.simulated, stage.info.holds, stage.unsafe = True, (), True
+    stage.run()
+    assert runs() == []
 
 
 @pytest.mark.parametrize(("skipped", "said"), [
@@ -485,7 +482,8 @@ def test_memory_that_is_not_to_be_had_is_told(stage, monkeypatch):
     )
     with pytest.raises(RunError, match=r"No space left on device.*recording\.ring_s"):
         stage.run()
-    assert stage.log[-3:] == ["given back", *UNDONE[2:]]
+    assert stage.open == set()
+    assert runs() == []
 
 
 class Run:

@@ -31,11 +31,12 @@ from hilctl.run.recovery import RecoveredRun
 from tests.fakes import SteppingClock
 
 
-def run(name, *, supervised=True, alive=True):
+def run(name, *, supervised=True, alive=True, recorded=False):
     card = SimpleNamespace(name=name, recording="a.mcap", supervisor=1, started=0.0)
     return SimpleNamespace(
-        card=card, supervised=supervised, alive=alive, socket=f"{name}.sock", ring=Path("none")
-    )
+        card=card, supervised=supervised, alive=alive, recorded=recorded,
+        socket=f"{name}.sock", ring=Path("none"),
+    )  # fmt: skip
 
 
 @pytest.fixture
@@ -82,6 +83,8 @@ def test_status_is_given_of_runs_that_do_not_answer(answers, monkeypatch):
     dead, left = run("a", supervised=False, alive=False), run("a", supervised=False)
     assert status_of(dead) == {"name": "a", "state": "dead"}
     assert status_of(left)["state"] == "ramping down without its supervisor"
+    unsafe = status_of(run("a", supervised=False, alive=False, recorded=True))
+    assert (unsafe["state"], unsafe["output_state"]) == ("dead", "unknown")
 
     monkeypatch.setattr(client, "ask", Mock(side_effect=RunError("no answer")))
     assert status_of(run("a")) == {"name": "a", "state": "not answering", "error": "no answer"}
@@ -249,23 +252,34 @@ def test_what_the_kernel_refuses_is_told(process, monkeypatch):
         request_stop(run_of(process.pid))
 
 
-def test_what_was_done_is_logged(monkeypatch, caplog):
-    found = [RecoveredRun("sine-7", Path("a.mcap"), safe=False, text="supervisor and loop died")]
-    monkeypatch.setattr("hilctl.run.recovery.recover_dead_runs", lambda: found)
-    monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(alive=True)])
-    finish_dead_runs()
-    assert caplog.messages == []
-    monkeypatch.setattr("hilctl.run.control.client.runs", lambda: [SimpleNamespace(alive=False)])
-    finish_dead_runs()
+@pytest.fixture
+def recovered(monkeypatch):
+    """Return a function that finishes the dead ones of runs, each of which becomes a result."""
+
+    def finish(result, *found):
+        monkeypatch.setattr("hilctl.run.recovery.recover_dead_runs", lambda: [result])
+        monkeypatch.setattr(client, "runs", lambda: found)
+        finish_dead_runs()
+
+    return finish
+
+
+DEAD = run("sine-7", supervised=False, alive=False)
+
+
+def test_what_was_done_is_logged(recovered, caplog):
+    result = RecoveredRun("sine-7", Path("a.mcap"), safe=False, text="supervisor and loop died")
+    recovered(result, run("a"), run("b", supervised=False, recorded=True))
+    assert caplog.messages == []  # one has a supervisor, the other a guardian alone
+    recovered(result, run("a"), DEAD)
     assert caplog.messages == [
         "sine-7 was not recorded to its end: supervisor and loop died",
         "recovered into a.mcap",
     ]
 
 
-def test_a_run_that_never_started_is_one_line(monkeypatch, caplog):
-    found = [RecoveredRun("sine-7", Path("a.mcap"), True, "nothing has moved", started=False)]
-    monkeypatch.setattr("hilctl.run.recovery.recover_dead_runs", lambda: found)
-    monkeypatch.setattr("hilctl.run.control.client.runs", lambda: [SimpleNamespace(alive=False)])
-    finish_dead_runs()
+def test_a_run_that_never_started_is_one_line(recovered, caplog):
+    recovered(
+        RecoveredRun("sine-7", Path("a.mcap"), True, "nothing has moved", started=False), DEAD
+    )
     assert len(caplog.messages) == 1

@@ -49,9 +49,9 @@ JOB_LIMITS = SilenceLimits(1.0, 1.0, 1.0, 1.0)
 
 def job_of(experiment, *, ring="", limits=JOB_LIMITS, locks=()):
     return Job(
-        experiment=experiment, files={}, folder="", ring=ring,
-        holds=[HOLDS] if locks else [], locks=[*locks], reference="", input_um="",
-        state=None, heat_a2=0.0, stands_um=None, segments=[], adapted=None, safe_value=0.25,
+        experiment=experiment, files={}, folder="", ring=ring, holds=[HOLDS] if locks else [],
+        locks=[*locks], reference="", input_um="", state=None, heat_a2=0.0, stands_um=None,
+        segments=[], adapted=None, safe_value=0.25,
         ramp_per_s=50.0, limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
     )  # fmt: skip
 
