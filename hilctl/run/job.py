@@ -51,6 +51,7 @@ class Job:
     ring: str
     holds: list[str]  # resources of the device, see DeviceInfo.holds
     locks: list[int]  # descriptors of their locks, which the processes of the run inherit
+    take_over: bool  # see DeviceLocks
     reference: str
     input_um: str
     state: list[float] | None
@@ -72,6 +73,7 @@ class Job:
         folder: "RunFolder",
         *,
         locks: list[int],
+        take_over: bool,
         supervisor: int,
         silence_s: float,
     ) -> Self:
@@ -90,6 +92,7 @@ class Job:
             ring=str(folder.ring),
             holds=list(loaded.device.info.holds),
             locks=locks,
+            take_over=take_over,
             reference=str(reference),
             input_um=str(input_um),
             state=None if begun.state is None else begun.state.tolist(),

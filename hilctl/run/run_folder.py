@@ -12,7 +12,6 @@ socket excludes other users and other folders for runs; any user can bind it, so
 to ignore a name that another user has bound. The process that holds the locks owns the device.
 """
 
-import errno
 import hashlib
 import json
 import logging
@@ -303,7 +302,7 @@ class DeviceLocks:
     Args:
         holds: Resources, see :attr:`hilctl.base.device.DeviceInfo.holds`.
         take_over: Whether to ignore other users.
-        inherited: The :attr:`descriptors` of the process that acquired the locks.
+        inherited: The :attr:`descriptors` of the process that acquires the locks.
 
     Raises:
         RunError: The file of a lock cannot be created.
@@ -312,7 +311,7 @@ class DeviceLocks:
     def __init__(
         self, holds: Sequence[str], *, take_over: bool = False, inherited: Sequence[int] = ()
     ) -> None:
-        self._take_over = take_over
+        self._take_over, self._acquired = take_over, bool(inherited)
         names = sorted(set(holds))
         self._files = dict(zip(names, inherited, strict=False))
         self._names = {
@@ -338,33 +337,35 @@ class DeviceLocks:
         return [*self._files.values(), *(each.fileno() for each in self._names.values())]
 
     def holder(self) -> str:
-        """Acquire all locks, or none if another run of this user has one: return its resource.
+        """Acquire all locks, or return a resource that another process has.
 
-        Raises:
-            InputError: Another user or another folder for runs has a resource.
+        No file is locked then. Names that are free stay bound until :meth:`release`.
         """
-        for name, file in self._files.items():
-            try:
-                take_lock(file)
-            except BlockingIOError:
-                for each in self._files.values():
-                    release_lock(each)
-                return name
-        for name, told in self._names.items():
-            try:
-                told.bind(_address(name))
-                told.listen(_BACKLOG)
-            except OSError as error:
-                if error.errno == errno.EINVAL:  # bound before
-                    continue
-                self._refuse(name)
+        if self._acquired:
+            return ""
+        try:
+            for name in self._files:
+                take_lock(self._files[name])
+            for name, told in self._names.items():
+                if not told.getsockname():
+                    self._bind(name, told)
+        except BlockingIOError:
+            for file in self._files.values():
+                release_lock(file)
+            return name
+        self._acquired = True
         return ""
 
     def acquire(self) -> None:
-        """Acquire all locks; raise InputError if another run has one."""
-        if name := self.holder():
-            holder = _holder(_address(name))
-            raise _in_use(name, holder if _is_trusted(holder) else None)
+        """Acquire all locks; raise InputError if another process has one."""
+        if not (name := self.holder()):
+            return
+        holder = _holder(_address(name))
+        if _is_trusted(holder):
+            raise _in_use(name, holder)
+        if is_locked(self._files[name]):  # by this user, who took the device over
+            raise _in_use(name, None)
+        raise _in_use(name, holder, _IF_STRANGER)
 
     def release(self) -> None:
         """Release the locks for all processes that share them; they can be acquired again."""
@@ -373,15 +374,18 @@ class DeviceLocks:
         for name, told in self._names.items():
             told.close()
             self._names[name] = socket.socket(socket.AF_UNIX)
+        self._acquired = False
 
-    def _refuse(self, name: str) -> None:
-        holder = _holder(_address(name))
-        if _is_trusted(holder):
-            raise _in_use(name, holder)
-        if not self._take_over:
-            raise _in_use(name, holder, _IF_STRANGER)
-        text = "%s may be in use by %s as well: only one program must drive a device"
-        _log.warning(text, name, _text_of(holder))
+    def _bind(self, name: str, told: socket.socket) -> None:
+        try:
+            told.bind(_address(name))
+            told.listen(_BACKLOG)
+        except OSError:
+            holder = _holder(_address(name))
+            if not self._take_over or _is_trusted(holder):
+                raise BlockingIOError from None
+            text = "%s may be in use by %s as well: only one program must drive a device"
+            _log.warning(text, name, _text_of(holder))
 
     def close(self) -> None:
         """Release the locks, unless processes that inherited them hold them."""
@@ -399,9 +403,9 @@ class DeviceLocks:
 
 
 @contextmanager
-def held_devices(holds: Sequence[str], *, take_over: bool = False) -> Iterator[None]:
+def held_devices(holds: Sequence[str]) -> Iterator[None]:
     """Lock a device's resources, see :meth:`DeviceLocks.acquire`."""
-    with DeviceLocks(holds, take_over=take_over) as locks:
+    with DeviceLocks(holds) as locks:
         locks.acquire()
         yield
 

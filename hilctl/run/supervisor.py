@@ -445,7 +445,12 @@ class Supervisor:
         # The supervisor may be silent until half of the ring is full.
         silence_s = recording.ring_s / 2.0 if recording.on_failure == "stop" else float("inf")
         job = Job.of(
-            self._checked, folder, locks=locks, supervisor=os.getpid(), silence_s=silence_s
+            self._checked,
+            folder,
+            locks=locks,
+            take_over=self._take_over,
+            supervisor=os.getpid(),
+            silence_s=silence_s,
         )
         job.write(folder.job)
         RunDescription.of(self._checked).write(folder.description)

@@ -29,7 +29,7 @@ from pathlib import Path
 from types import FrameType
 
 from hilctl.base.device import Device
-from hilctl.base.errors import HilctlError, InputError
+from hilctl.base.errors import HilctlError
 from hilctl.loop.safe_output import (
     PATIENT_AFTER_S,
     PATIENT_PAUSE_S,
@@ -201,8 +201,9 @@ class Guardian:
         self._ring, self._page = ring, ring.page
         self._device, self._job = device, job
         self._prepare = prepare
-        self._locks = DeviceLocks(job.holds, inherited=job.locks if has_locks else ())
-        self._has_locks = has_locks
+        self._locks = DeviceLocks(
+            job.holds, take_over=job.take_over, inherited=job.locks if has_locks else ()
+        )
         self._ended = threading.Event()  # by the user
 
     def watch(self, pidfd: int, loop: int) -> None:
@@ -282,7 +283,6 @@ class Guardian:
         page.put(PageField.GUARDIAN_PHASE, GuardianPhase.WAITING)
         page.put(PageField.CLAIM, 0)
         self._locks.release()
-        self._has_locks = False
         self._ended.wait(_CLAIM_S)
 
     def _awaits_device(self) -> bool:
@@ -290,10 +290,9 @@ class Guardian:
         while not (self._ended.is_set() or self._page.get(PageField.RELIEVED)):
             self._beat()
             if not (self._page.get(PageField.STANDS_IN) and self._supervised()):
-                with suppress(InputError):  # another user has the device
-                    self._has_locks = self._has_locks or not self._locks.holder()
-                if self._has_locks:
+                if not self._locks.holder():
                     return True
+                self._locks.release()
             self._page.put(PageField.GUARDIAN_PHASE, GuardianPhase.WAITING)
             self._ended.wait(_WAIT_S)
         return False

@@ -33,7 +33,7 @@ def test_the_job_is_what_was_checked_even_where_its_files_have_gone(folder, tmp_
     shutil.copytree(CONFIGS, tmp_path / "configs")
     (tmp_path / "link").symlink_to("configs")
     checked = checked_experiment(tmp_path / "link/demo.yaml", ["waveform.duration_s=1.0"])
-    job = Job.of(checked, folder, locks=[5, 6], supervisor=7, silence_s=5.0)
+    job = Job.of(checked, folder, locks=[5, 6], take_over=True, supervisor=7, silence_s=5.0)
     shutil.rmtree(tmp_path / "configs")
     job.write(folder.job)
     again = Job.read(folder.job)
@@ -46,7 +46,7 @@ def test_the_job_is_what_was_checked_even_where_its_files_have_gone(folder, tmp_
     np.testing.assert_array_equal(reference, checked.reference.values)
     np.testing.assert_array_equal(input_um, checked.begun.input_um)
     assert (again.supervisor, again.silence_s, again.ring) == (7, 5.0, str(folder.ring))
-    assert (again.holds, again.locks) == ([], [5, 6])
+    assert (again.holds, again.locks, again.take_over) == ([], [5, 6], True)
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
@@ -61,7 +61,7 @@ def test_an_experiment_goes_through_its_text_unchanged(path):
 
 def test_infinite_numbers_and_states_are_read_back(folder):
     checked = checked_experiment(CONFIGS / "demo.yaml", ["waveform.duration_s=1.0"])
-    job = Job.of(checked, folder, locks=[], supervisor=1, silence_s=math.inf)
+    job = Job.of(checked, folder, locks=[], take_over=False, supervisor=1, silence_s=math.inf)
     job = replace(job, state=[0.1, -0.0, 1 / 3], adapted=[[math.inf, 0.1]])
     job.write(folder.job)
     assert Job.read(folder.job) == job
@@ -69,7 +69,7 @@ def test_infinite_numbers_and_states_are_read_back(folder):
 
 def test_an_input_that_is_the_reference_is_kept_once(folder):
     plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
-    job = Job.of(plain, folder, locks=[], supervisor=1, silence_s=1.0)
+    job = Job.of(plain, folder, locks=[], take_over=False, supervisor=1, silence_s=1.0)
     assert (job.reference == job.input_um) == (plain.begun.input_um is plain.reference.values)
     assert (job.state is None) == (plain.begun.state is None)
 
@@ -78,7 +78,7 @@ def test_samples_that_find_no_room_are_told(folder, monkeypatch):
     plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
     monkeypatch.setattr(np, "save", Mock(side_effect=OSError("8000 requested and 512 written")))
     with pytest.raises(RunError, match=r"8000 requested.*recording\.ring_s"):
-        Job.of(plain, folder, locks=[], supervisor=1, silence_s=1.0)
+        Job.of(plain, folder, locks=[], take_over=False, supervisor=1, silence_s=1.0)
 
 
 @pytest.mark.parametrize(("given", "simulated", "real_time_s", "ordinary_s", "stopped_s"), [

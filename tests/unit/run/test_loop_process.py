@@ -73,7 +73,9 @@ class Prepared:
         self.page = self.ring.page
         self.page.put(PageField.HAS_DEVICE, 1)
         self.page.put(PageField.GO, 1)
-        self.job = Job.of(checked, folder, locks=[], supervisor=os.getppid(), silence_s=1.0)
+        self.job = Job.of(
+            checked, folder, locks=[], take_over=False, supervisor=os.getppid(), silence_s=1.0
+        )
         self.device = Closing(checked.loaded.device.info, **device_is)
         self.loaded = replace(checked.loaded, device=self.device)
         self._patch = monkeypatch

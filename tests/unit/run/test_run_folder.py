@@ -15,6 +15,8 @@ import pytest
 from hilctl.base.errors import InputError, RunError
 from hilctl.run import run_folder as run_folder_module
 from hilctl.run.run_folder import (
+    GUARDIAN,
+    DeviceLocks,
     base_folder,
     held_devices,
     keep_removed,
@@ -50,11 +52,14 @@ def test_run_is_seen_while_it_lives_and_gone_afterwards(tmp_path):
 
 def test_a_folder_that_is_kept_is_a_dead_run_to_the_next_command(tmp_path):
     with made(tmp_path) as (folder, _):
-        folder.keep()
+        folder.keep(recorded=False)
     assert runs() == [folder]
     assert not folder.alive
     with taken_over(folder) as ours:
         assert ours
+    folder.keep(recorded=True)
+    with taken_over(folder) as ours:
+        assert not ours  # it stays for its output alone
     folder.remove()
     assert runs() == []
 
@@ -220,6 +225,7 @@ def test_no_place_at_all_says_what_is_wrong_with_each(places):
 
 
 NAME = f"test:{os.getpid()}:"  # locks are the whole machine's, and so is /dev/ttyUSB0
+STRANGER = 2**31 - 1  # a user without a name
 
 
 def hold(*names):
@@ -241,32 +247,68 @@ def test_device_is_held_by_one_run(tmp_path):
     hold(device, device)
 
 
+def test_locks_are_acquired_after_they_are_opened_and_all_or_none():
+    first, second = f"{NAME}1", f"{NAME}2"
+    with DeviceLocks((second, first)) as locks, DeviceLocks((second,)) as other:
+        assert len(locks.descriptors) == 4
+        other.acquire()
+        assert locks.holder() == second
+        hold(first)
+        other.release()
+        assert locks.holder() == ""
+        refused(first)
+        assert other.holder() == second
+        locks.release()
+        hold(first, second)
+        locks.acquire()
+        locks.acquire()
+        refused(first, second)
+
+
 def test_holder_without_a_run_is_named_by_the_kernel():
     name = f"{NAME}{'long' * 50}"
     with held_devices((name,)):
         refused(name, match=f"in use by process {os.getpid()} of ")
 
 
-@pytest.mark.parametrize("listening", [True, False])
-def test_another_user_can_not_lock_this_one_out(monkeypatch, caplog, listening):
+@pytest.fixture
+def squatted(monkeypatch):
+    """A resource whose name a socket of another user has bound, and the socket."""
     name = f"{NAME}squatted"
-    address = b"\0hilctl/device/" + hashlib.sha256(name.encode()).hexdigest().encode()
     asked = run_folder_module._holder
-
-    def holder(address):
-        found = asked(address)
-        return found and (found[0], 2**31 - 1)  # a user without a name
-
-    monkeypatch.setattr(run_folder_module, "_holder", holder)
+    monkeypatch.setattr(
+        run_folder_module,
+        "_holder",
+        lambda address: (found := asked(address)) and (found[0], STRANGER),
+    )
     with socket.socket(socket.AF_UNIX) as squatter:
-        squatter.bind(address)
-        if listening:
-            squatter.listen()
-        with held_devices((name,)):
-            (warned,) = caplog.messages
-            assert name in warned
-            assert (f"process {os.getpid()} of user {2**31 - 1}" in warned) == listening
-            refused(name, match="in use by another run")
+        squatter.bind(b"\0hilctl/device/" + hashlib.sha256(name.encode()).hexdigest().encode())
+        yield name, squatter
+
+
+@pytest.mark.parametrize("listening", [True, False])
+def test_a_device_of_another_user_is_refused_and_can_be_taken_over(squatted, caplog, listening):
+    name, squatter = squatted
+    if listening:
+        squatter.listen()
+    refused(name, match="hilctl run --take-over")
+    with DeviceLocks((name,), take_over=True) as locks:
+        locks.acquire()
+        locks.acquire()
+        (warned,) = caplog.messages
+        assert name in warned
+        assert (f"process {os.getpid()} of user {STRANGER}" in warned) == listening
+        refused(name, match="wait for its end")  # its holder is this user's
+
+
+def test_a_process_that_waits_for_another_user_keeps_nothing(squatted):
+    name, _ = squatted
+    first = f"{NAME}a"
+    assert first < name
+    with DeviceLocks((first, name)) as waiting:
+        assert waiting.holder() == name
+        waiting.release()
+        hold(first)
 
 
 def test_a_device_stays_held_when_the_folder_is_removed():
@@ -275,19 +317,56 @@ def test_a_device_stays_held_when_the_folder_is_removed():
     with held_devices((name,)):
         shutil.rmtree(base_folder())
         refused(name, match="in use by process")
+        with DeviceLocks((name,), take_over=True) as locks:
+            assert locks.holder() == name
 
 
-def test_lock_lives_as_long_as_a_process_that_inherited_it(monkeypatch):
-    """The loop outlives its supervisor: nobody may have its device before it is safe."""
+def test_processes_that_inherited_the_locks_hold_them_until_they_end():
+    """The loop outlives its supervisor, and is started before the locks are acquired."""
     name = f"{NAME}inherited"
-    with held_devices((name,)) as locks:
+    with DeviceLocks((name,)) as locks:
         child = subprocess.Popen(
-            [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=locks
+            [sys.executable, "-c", "input()"], stdin=subprocess.PIPE, pass_fds=locks.descriptors
         )
+        hold(name)
+        locks.acquire()
     refused(name)
-    monkeypatch.setattr(run_folder_module, "_holder", lambda address: (2**22 + 1, os.geteuid()))
-    refused(name, match="hilctl stop --run")  # its supervisor is gone
     child.communicate(b"\n", timeout=30)
+    hold(name)
+
+
+def test_a_process_that_inherited_the_locks_can_release_and_acquire_them():
+    name = f"{NAME}passed on"
+    with DeviceLocks((name,)) as locks:
+        locks.acquire()
+        copies = [os.dup(each) for each in locks.descriptors]
+    with DeviceLocks((name,), inherited=copies) as guardian:
+        refused(name)
+        guardian.release()
+        hold(name)
+        assert guardian.holder() == ""
+        refused(name)
+
+
+def test_a_guardian_that_holds_a_device_is_named_with_the_command_that_ends_it(
+    tmp_path, monkeypatch
+):
+    """Also if its run is in another folder of HILCTL_RUNS."""
+    name = f"{NAME}guarded"
+    with run_folder("sine", tmp_path / "a.mcap", 12.0, (name,)) as (folder, _):
+        folder.keep(recorded=True)
+    program = "import sys; print(flush=True); input()"
+    words = [sys.executable, "-c", program, GUARDIAN, str(folder.job), "act"]
+    with DeviceLocks((name,)) as locks:
+        locks.acquire()
+        guardian = subprocess.Popen(
+            words, stdin=subprocess.PIPE, stdout=subprocess.PIPE, pass_fds=locks.descriptors
+        )
+    guardian.stdout.readline()
+    monkeypatch.setenv("HILCTL_RUNS", str(tmp_path / "others"))
+    run = folder.card.name
+    refused(name, match=f"HILCTL_RUNS={folder.path.parent} hilctl stop --run {run} ends it")
+    guardian.communicate(b"\n", timeout=30)
     hold(name)
 
 

@@ -120,9 +120,9 @@ class Neighbours:
         finally:
             self.open.remove(what)
 
-    def job(self, checked, folder, *, locks, supervisor, silence_s):
+    def job(self, checked, folder, *, locks, take_over, supervisor, silence_s):
         assert supervisor == os.getpid()
-        self.locks, self.silence_s = locks, silence_s
+        self.locks, self.take_over, self.silence_s = locks, take_over, silence_s
         return SimpleNamespace(write=lambda path: path.touch())
 
     def child(self, folder, page, inherits):

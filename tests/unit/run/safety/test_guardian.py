@@ -1,5 +1,6 @@
 """The guardian: what it takes for a dead or hanging loop, and what it does then."""
 
+import fcntl
 import os
 import select
 import signal
@@ -16,6 +17,7 @@ import pytest
 
 from hilctl.base.errors import DeviceError
 from hilctl.loop.safe_output import LoopOutcome, SafeGoal
+from hilctl.run import run_folder
 from hilctl.run.job import Job, SilenceLimits
 from hilctl.run.run_folder import DeviceLocks
 from hilctl.run.safety import guardian
@@ -47,11 +49,11 @@ IGNORED = (signal.SIGINT, signal.SIGTERM, signal.SIGHUP)
 JOB_LIMITS = SilenceLimits(1.0, 1.0, 1.0, 1.0)
 
 
-def job_of(experiment, *, ring="", limits=JOB_LIMITS, locks=()):
+def job_of(experiment, *, ring="", limits=JOB_LIMITS, locks=(), take_over=False):
     return Job(
         experiment=experiment, files={}, folder="", ring=ring, holds=[HOLDS] if locks else [],
-        locks=[*locks], reference="", input_um="", state=None, heat_a2=0.0, stands_um=None,
-        segments=[], adapted=None, safe_value=0.25,
+        locks=[*locks], take_over=take_over, reference="", input_um="", state=None, heat_a2=0.0,
+        stands_um=None, segments=[], adapted=None, safe_value=0.25,
         ramp_per_s=50.0, limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
     )  # fmt: skip
 
@@ -105,11 +107,12 @@ def guarded(tmp_path):
     before = signal.getsignal(signal.SIGTERM)
     made = SimpleNamespace(loop=loop, page=page, ring=ring, device=Device(loop), pidfd=pidfd)
 
-    def guard(hang_s=60.0):
+    def guard(hang_s=60.0, **more):
         limits = SilenceLimits(hang_s, hang_s, 60.0, hang_s)
         with DeviceLocks([HOLDS]) as locks:
             locks.acquire()
-            job = job_of("", limits=limits, locks=[os.dup(each) for each in locks.descriptors])
+            copies = [os.dup(each) for each in locks.descriptors]
+            job = job_of("", limits=limits, locks=copies, **more)
         watcher = Guardian(ring, made.device, job)
         watcher.watch(pidfd, loop.pid)
         watcher._locks.close()
@@ -319,6 +322,30 @@ def test_a_claimed_device_is_driven_again_if_the_other_command_ends(guarded, cla
     values = [value for value, _ in guarded.device.asked]
     assert max(values) < 0.5
     assert values[-1] == 0.25
+
+
+def test_a_run_that_took_over_from_another_user_is_protected_after_a_claim(guarded, monkeypatch):
+    """The other user's process has the name of the device when the guardian acts again."""
+    device, make_safe, release = guarded.device, guarded.device.make_safe, DeviceLocks.release
+
+    def claiming(value):
+        guarded.page.put(PageField.CLAIM, device.error is not None)
+        make_safe(value)
+
+    def released(locks):
+        device.error = None
+        release(locks)
+        stranger.acquire()
+        fcntl.flock(stranger.descriptors[0], fcntl.LOCK_UN)  # a file of the other user's own
+
+    monkeypatch.setattr(run_folder, "_holder", lambda address: (1, 2**31 - 1))
+    monkeypatch.setattr(DeviceLocks, "release", released)
+    device.error, device.make_safe = DeviceError("no answer"), claiming
+    device.close = lambda: None
+    guarded.loop.kill()
+    with DeviceLocks([HOLDS]) as stranger:
+        guarded.guard(take_over=True)
+    assert guarded.page.safe_result().confirmed
 
 
 def test_a_relieved_guardian_ends_and_leaves_the_device_alone(guarded, claimed):
