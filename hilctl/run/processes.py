@@ -12,7 +12,7 @@ from contextlib import ExitStack, suppress
 from typing import Any, Literal
 
 from hilctl.base.errors import InputError, RunError
-from hilctl.run.run_folder import GUARDIAN, LOOP, DeviceLocks, RunFolder, runs
+from hilctl.run.run_folder import GUARDIAN, LOOP, DeviceLocks, RunFolder, locked_run, runs
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase, SharedPage
 
@@ -195,7 +195,8 @@ class GuardianRelief:
         for run in runs() if holds else []:
             if set(holds) & set(run.card.holds) and not run.supervised:
                 with suppress(OSError, ValueError):  # it has just ended
-                    self._pages.append((run, SampleRing(run.ring).page))
+                    if not (page := SampleRing(run.ring).page).is_settled():
+                        self._pages.append((run, page))
 
     @property
     def found(self) -> bool:
@@ -207,14 +208,16 @@ class GuardianRelief:
         """The runs whose guardian is active."""
         return [run for run, _ in self._pages if run.alive]
 
-    def acquire(self, locks: DeviceLocks, stopped: Callable[[], bool] = lambda: False) -> None:
-        """Acquire the locks of a device; raise InputError if its guardian does not release them."""
+    def acquire(self, locks: DeviceLocks, check: Callable[[], object] = lambda: None) -> None:
+        """Acquire the locks of a device; raise InputError if its guardian does not release them.
+
+        ``check`` is called repeatedly, and may raise an error to give up.
+        """
         deadline_s = time.monotonic() + _CLOSE_S
-        while self.runs and locks.holder() and not stopped():
+        while self.runs and locks.holder() and time.monotonic() < deadline_s:
+            check()
             for _, page in self._pages:
                 page.put(PageField.CLAIM, 1)
-            if time.monotonic() > deadline_s:
-                break
             time.sleep(_POLL_S)
         locks.acquire()
 
@@ -228,14 +231,16 @@ class GuardianRelief:
         for run, page in self._pages:
             page.put(PageField.RELIEVED, 1)
             if page.get(PageField.RECORDED):
-                run.remove()
+                with suppress(OSError):
+                    run.remove()
 
     def restart(self) -> None:
         """Start the guardians again that have died; they act when the device is free."""
         for run, page in self._pages:
             if not run.alive and run.kept:
                 try:
-                    GuardianProcess(run, page, (), "wait")
+                    with locked_run(run) as lock:
+                        GuardianProcess(run, page, [lock], "wait")
                 except OSError as error:
                     text = "the guardian of %s cannot be started again: %s"
                     _log.error(text, run.card.name, error.strerror)

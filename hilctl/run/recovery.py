@@ -19,7 +19,7 @@ from hilctl.recording.recover import recover_recording
 from hilctl.run.metadata import end_facts
 from hilctl.run.run_folder import RunFolder, runs, taken_over
 from hilctl.run.shared.ring import SampleRing, safe_result_of
-from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase
+from hilctl.run.shared.shared_page import PageField, PageSlot, Phase
 
 _RESULT_S = 1.0
 _POLL_S = 0.02
@@ -73,9 +73,10 @@ def _finish(run: RunFolder, recovered: RecoveredRun) -> None:
     if recovered.safe or not (run.card.holds and recovered.started):
         run.remove()
         return
-    with suppress(OSError, ValueError):
-        SampleRing(run.ring).page.put(PageField.RECORDED, 1)  # its guardian removes the folder
     run.keep(recorded=True)
+    with suppress(OSError, ValueError):
+        # Last: its guardian removes the folder from now on.
+        SampleRing(run.ring).page.put(PageField.RECORDED, 1)
     if not run.alive and _is_settled(run):
         run.remove()
 
@@ -83,11 +84,9 @@ def _finish(run: RunFolder, recovered: RecoveredRun) -> None:
 def _is_settled(run: RunFolder) -> bool:
     """Return whether the output of a dead run needs no more attention."""
     try:
-        page = SampleRing(run.ring, look_only=True).page
+        return SampleRing(run.ring, look_only=True).page.is_settled()
     except (OSError, ValueError):
         return True
-    over = page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.DONE
-    return over or bool(page.get(PageField.RELIEVED)) or page.ended_safely()
 
 
 def _recover(run: RunFolder) -> RecoveredRun:

@@ -489,6 +489,13 @@ def _locked(path: Path) -> Iterator[int]:
 
 
 @contextmanager
+def locked_run(run: RunFolder) -> Iterator[int]:
+    """Lock a dead run for its new guardian, and yield the descriptor; raise OSError if alive."""
+    with _locked(run.path / _CARD) as descriptor:
+        yield descriptor
+
+
+@contextmanager
 def taken_over(run: RunFolder) -> Iterator[bool]:
     """Act for the dead supervisor of a run; yield whether no other command does, or did."""
     try:

@@ -297,7 +297,7 @@ class Supervisor:
                 inherits = locks.descriptors + own
                 child = LoopProcess(folder, ring.page, inherits)
                 run = folder, ring, child, recording
-                acquire = partial(relief.acquire, locks, lambda: self._stop_signal != 0)
+                acquire = partial(relief.acquire, locks, self._raise_if_stopped)
                 safety, start_ns = self._start(stack, *run, inherits, acquire)
                 started = RunMonitor(self._checked, ring, child, safety, recording)
             except BaseException:

@@ -8,6 +8,8 @@ from pathlib import Path
 
 import pytest
 
+from hilctl.run.processes import signal_guardian
+from hilctl.run.run_folder import runs
 from tests.commands import hilctl
 from tests.faults.conftest import MODULE, Emulated, tcp
 
@@ -92,6 +94,23 @@ def test_safe_by_hand_relieves_the_guardian_and_gives_back_what_it_cannot_do(aba
     assert run["output_state"] == "set"
     assert said("stop", "--run", run["name"])["ended"]
     assert active() == []
+
+
+@pytest.mark.long
+def test_safe_by_hand_starts_a_dead_guardian_again(abandoned):
+    """Which ``hilctl status`` lists, and ``hilctl stop`` ends."""
+    (run,) = runs()
+    assert signal_guardian(run, signal.SIGKILL, 10.0)
+    assert [(run["state"], run["output_state"]) for run in active()] == [("dead", "unknown")]
+    found = said("safe", abandoned.experiment, code=3)
+    assert (found["output_state"], found["guardian_active"]) == ("unknown", True)
+    abandoned.come_back()
+    abandoned.await_output(0.0, within_s=10.0)
+    (run,) = active()
+    assert run["state"] == "setting the safe value"
+    assert said("stop", "--run", run["name"])["ended"]
+    assert active() == []
+    assert said("safe", abandoned.experiment)["output_state"] == "confirmed"
 
 
 def test_a_new_run_relieves_the_guardian_once_it_starts(abandoned):

@@ -91,7 +91,7 @@ def put_safe(
         unit=info.command_unit,
         output=output.state,
         error=output.error,
-        guardian_active=relief.found and not output.final,
+        guardian_active=bool(relief.runs) and not output.final,
     )
 
 

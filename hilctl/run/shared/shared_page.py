@@ -295,6 +295,12 @@ class SharedPage:
             return None
         return self.get_float(PageField.LAST_SAFE_WRITE) + 0.0
 
+    def is_settled(self) -> bool:
+        """Return whether the output of a run without supervisor needs no attention."""
+        over = self.get(PageField.RELIEVED) or not self.get(PageField.GO)
+        done = self.get(PageField.GUARDIAN_PHASE) == GuardianPhase.DONE
+        return bool(over) or done or self.ended_safely()
+
     def ended_safely(self) -> bool:
         """Return whether the loop ended with a safe output."""
         if self.get(PageField.PHASE) != Phase.ENDED:

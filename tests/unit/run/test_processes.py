@@ -1,5 +1,6 @@
-"""How the loop's process ended, or why it never started."""
+"""The loop's process: its start and its end; guardians of earlier runs."""
 
+import os
 import signal
 import subprocess
 from pathlib import Path
@@ -9,10 +10,14 @@ from unittest.mock import Mock
 import pytest
 
 from hilctl.base.errors import InputError, RunError
+from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run import processes as module
-from hilctl.run.processes import LoopProcess
+from hilctl.run.processes import GuardianRelief, LoopProcess
+from hilctl.run.run_folder import DeviceLocks, held_devices, run_folder, runs
 from hilctl.run.shared.ring import SampleRing
-from hilctl.run.shared.shared_page import PageField, PageSlot, Phase
+from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase
+
+HOLDS = f"tcp:10.9.8.7:{os.getpid()}"  # locks are the whole machine's
 
 
 class FakeProcess:
@@ -83,6 +88,16 @@ def test_a_stop_comes_before_the_start(started):
     child.await_ready(lambda: True)
 
 
+def test_the_device_is_acquired_when_the_loop_needs_it(started):
+    child, page = started
+    page.put(PageField.AWAITS_DEVICE, 1)
+    with pytest.raises(InputError, match="in use"):
+        child.await_ready(never, Mock(side_effect=InputError("in use")))
+    assert page.get(PageField.HAS_DEVICE) == 0
+    child.await_ready(never, lambda: page.put(PageField.PHASE, Phase.READY))
+    assert page.get(PageField.HAS_DEVICE) == 1
+
+
 def test_a_loop_that_died_or_broke_says_what_it_can(started):
     child, page = started
     child._process.code = 7
@@ -103,3 +118,121 @@ def test_a_loop_that_the_kernel_keeps_is_not_waited_for(started):
     child._process.wait, child._process.kill = wait, lambda: None
     child.kill()
     assert "blocked in the kernel" in child.death()
+
+
+@pytest.fixture
+def left(tmp_path):
+    """Return a function that leaves a run of a device without supervisor and loop."""
+    held = []
+
+    def leave(*, guarded=True, recorded=True, kept=True, holds=(HOLDS,)):
+        with run_folder("sine", tmp_path / "a.mcap", 1.0, holds) as (folder, own):
+            page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+            page.put(PageField.GO, 1)
+            page.put(PageField.RECORDED, recorded)
+            folder.keep(recorded=recorded)
+            held.extend(os.dup(each) for each in own if guarded)
+        if not kept:
+            (folder.path / "kept").unlink()
+        return folder, page
+
+    yield leave
+    for each in held:
+        os.close(each)
+
+
+@pytest.fixture
+def sleeping(monkeypatch):
+    """Replace time by one that passes in sleeps; return a list of functions, called by sleeps."""
+    clock, calls = SimpleNamespace(now_s=0.0), []
+
+    def sleep(seconds):
+        clock.now_s += seconds
+        if calls:
+            calls.pop(0)()
+
+    monkeypatch.setattr(module, "time", SimpleNamespace(monotonic=lambda: clock.now_s, sleep=sleep))
+    return calls
+
+
+def test_a_device_is_claimed_until_its_guardian_has_released_it(left, sleeping):
+    _, page = left()
+    with DeviceLocks([HOLDS]) as guardian, DeviceLocks([HOLDS]) as locks:
+        guardian.acquire()
+        # A claim may come too early, and is repeated.
+        sleeping += [lambda: page.put(PageField.CLAIM, 0), lambda: None, guardian.release]
+        GuardianRelief([HOLDS]).acquire(locks)
+        assert guardian.holder() == HOLDS
+    assert page.get(PageField.CLAIM) == 1
+    assert page.get(PageField.RELIEVED) == 0
+
+
+def test_a_guardian_that_keeps_its_device_is_not_waited_for_without_end(left, sleeping):
+    left()
+    with held_devices([HOLDS]), DeviceLocks([HOLDS]) as locks:
+        relief = GuardianRelief([HOLDS])
+        with pytest.raises(InputError, match=f"{HOLDS} is in use"):
+            relief.acquire(locks)
+        with pytest.raises(RunError, match="stopped"):
+            relief.acquire(locks, Mock(side_effect=RunError("stopped")))
+
+
+def test_a_free_device_is_acquired_without_a_claim(left):
+    _, page = left()
+    with DeviceLocks([HOLDS]) as locks:
+        GuardianRelief([HOLDS]).acquire(locks)
+    assert page.get(PageField.CLAIM) == 0
+
+
+def test_relieved_runs_stay_for_samples_that_are_not_recorded(left):
+    (_, page), (missing, other) = left(), left(recorded=False)
+    relief = GuardianRelief([HOLDS])
+    relief.note_write(0.5)
+    relief.relieve()
+    assert [each.get(PageField.RELIEVED) for each in (page, other)] == [1, 1]
+    assert [each.last_safe_write() for each in (page, other)] == [0.5, 0.5]
+    assert runs() == [missing]
+    assert not GuardianRelief([HOLDS]).found
+
+
+@pytest.mark.parametrize("settle", [
+    lambda page: page.put(PageField.GUARDIAN_PHASE, GuardianPhase.DONE),
+    lambda page: page.leave_outcome(LoopOutcome("completed", "", 7, "confirmed", 0)),
+    lambda page: page.put(PageField.GO, 0),
+], ids=["guardian ended", "loop ended", "never started"])  # fmt: skip
+def test_a_run_whose_output_is_safe_needs_no_relief(left, settle):
+    """Such as one whose samples wait for room on the disk."""
+    _, page = left(guarded=False, recorded=False)
+    settle(page)
+    assert not GuardianRelief([HOLDS]).found
+
+
+def test_runs_of_other_devices_keep_their_guardians(left):
+    left(holds=("tcp:10.9.8.6:502",))
+    assert not GuardianRelief([HOLDS]).found
+    assert not GuardianRelief([]).found
+
+
+def test_dead_guardians_are_started_again_with_the_lock_of_their_run(left, monkeypatch, caplog):
+    dead, _ = left(guarded=False)
+    left()
+    left(guarded=False, kept=False)
+    started = []
+
+    def start_process(*words, inherits, stderr):
+        started.append((words, [os.dup(each) for each in inherits]))
+
+    relief = GuardianRelief([HOLDS])
+    monkeypatch.setattr(module, "start_process", Mock(side_effect=OSError(12, "no memory")))
+    relief.restart()
+    (said,) = caplog.messages
+    assert dead.card.name in said
+    monkeypatch.setattr(module, "start_process", start_process)
+    relief.restart()
+    ((words, locks),) = started
+    assert words == ("hilctl.run.safety.guardian", str(dead.job), "wait")
+    assert dead.alive
+    assert dead in relief.runs
+    for each in locks:
+        os.close(each)
+    assert not dead.alive

@@ -1,7 +1,7 @@
-"""Runs whose processes died: what the ring holds goes into the recording, and the folder goes."""
+"""Runs whose processes died: the samples in the ring are recorded, and the folder is removed."""
 
 import json
-import shutil
+import os
 from dataclasses import asdict
 from pathlib import Path
 
@@ -10,26 +10,36 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.recording.reader import read
+from hilctl.run.control.client import status_of
 from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import dismiss, run_folder, runs
 from hilctl.run.shared.ring import SampleRing
-from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, SafeActionResult
+from hilctl.run.shared.shared_page import (
+    GuardianPhase,
+    PageField,
+    PageSlot,
+    Phase,
+    SafeActionResult,
+)
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 
 
 @pytest.fixture
 def dead(tmp_path):
-    """Leave the folder of a dead run behind; yield a function that does, given its ring."""
+    """Leave the folder of a dead run behind; yield a function that does, given its ring.
 
-    def leave(fill=lambda folder: None):
+    With a list for ``guardian`` its lock is held until the test closes the descriptor in it.
+    """
+
+    def leave(fill=lambda folder: None, *, holds=(), guardian=None):
         recording = tmp_path / "a.mcap"
         recording.write_bytes(GOLDEN.read_bytes()[:-100])
-        kept = tmp_path / "kept"
-        with run_folder("sine", recording, 12.0) as (folder, _):
+        with run_folder("sine", recording, 12.0, holds) as (folder, (lock,)):
             fill(folder)
-            shutil.copytree(folder.path, kept)
-        shutil.move(kept, folder.path)
+            folder.keep(recorded=False)
+            if guardian is not None:
+                guardian.append(os.dup(lock))
         return recording
 
     return leave
@@ -80,6 +90,91 @@ def test_what_the_guardian_did_is_said(dead, error, words):
     assert words in orphan.text
     assert ("NOT confirmed to be safe" in orphan.text) == bool(error)
     assert read(recording).samples.index.size > 0
+
+
+HOLDS = ("tcp:10.9.8.7:502",)
+
+
+def page_of(run):
+    return SampleRing(run.ring).page
+
+
+def unsafe(folder):
+    """Leave a guardian that has not yet reached the device."""
+    page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+    page.put(PageField.PHASE, Phase.RUNNING)
+    page.put(PageField.GO, 1)
+    page.put(PageField.GUARDIAN_PHASE, GuardianPhase.ACTING)
+    page.leave_safe_result(SafeActionResult(False, "unknown", "no answer", final=False))
+
+
+def watching(folder):
+    unsafe(folder)
+    page_of(folder).put(PageField.GUARDIAN_PHASE, GuardianPhase.WATCHING)
+
+
+def test_a_recording_is_completed_while_the_guardian_acts(dead):
+    guardian = []
+    recording = dead(unsafe, holds=HOLDS, guardian=guardian)
+    (orphan,) = recover_dead_runs()
+    assert (orphan.safe, orphan.kept) == (False, None)
+    before = recording.read_bytes()
+    assert before.endswith(b"\x89MCAP0\r\n")  # complete
+    (run,) = runs()
+    assert (run.recorded, run.supervised) == (True, False)
+    assert page_of(run).get(PageField.RECORDED) == 1  # so that the guardian removes the folder
+    assert recover_dead_runs() == []
+    assert runs() == [run]
+    assert recording.read_bytes() == before
+    assert status_of(run)["state"] == "setting the safe value"
+    os.close(guardian.pop())
+
+
+def test_a_recording_is_left_to_a_loop_that_still_ramps(dead):
+    guardian = []
+    recording = dead(watching, holds=HOLDS, guardian=guardian)
+    before = recording.read_bytes()
+    assert recover_dead_runs() == []
+    assert recording.read_bytes() == before
+    os.close(guardian.pop())
+    assert len(recover_dead_runs()) == 1
+
+
+@pytest.fixture
+def orphan(dead):
+    """A recovered run of a real device, whose processes ended before the output was safe."""
+    dead(unsafe, holds=HOLDS)
+    assert len(recover_dead_runs()) == 1
+    (run,) = runs()
+    return run
+
+
+def test_a_dead_run_stays_listed_while_its_output_is_not_safe(orphan):
+    for _ in range(2):
+        assert recover_dead_runs() == []
+        assert runs() == [orphan]
+        status = status_of(orphan)
+        assert (status["state"], status["output_state"]) == ("dead", "unknown")
+        assert orphan.card.name in status["error"]
+    dismiss(orphan.card.name)
+    assert runs() == []
+
+
+@pytest.mark.parametrize("settle", [
+    lambda page: page.put(PageField.RELIEVED, 1),
+    lambda page: page.put(PageField.GUARDIAN_PHASE, GuardianPhase.DONE),
+], ids=["relieved", "guardian ended"])  # fmt: skip
+def test_a_dead_run_is_forgotten_once_its_output_is_settled(orphan, settle):
+    settle(page_of(orphan))
+    assert recover_dead_runs() == []
+    assert runs() == []
+
+
+def test_a_dead_run_of_a_simulated_device_is_removed(dead):
+    dead(unsafe)
+    (recovered,) = recover_dead_runs()
+    assert not recovered.safe
+    assert runs() == []
 
 
 def test_a_living_run_is_left_alone(tmp_path):

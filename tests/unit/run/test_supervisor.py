@@ -213,6 +213,7 @@ def earlier(tmp_path):
     """Page of an earlier run of the device, whose processes ended before its output was safe."""
     with run_folder("earlier", tmp_path / "earlier.mcap", 1.0, (HOLDS,)) as (folder, _):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+        page.put(PageField.GO, 1)
         page.put(PageField.RECORDED, 1)
         folder.keep(recorded=True)
     return page
