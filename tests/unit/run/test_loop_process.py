@@ -7,6 +7,7 @@ import signal
 import sys
 import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -238,6 +239,8 @@ def orphaned(prepared, monkeypatch):
     monkeypatch.setattr(loop_process, "be_ordinary", lambda: None)
     monkeypatch.setattr(loop_process, "keep_removed", lambda: None)
     monkeypatch.setattr(loop_process.os, "execv", lambda program, given: words.append(given))
+    monkeypatch.setattr(loop_process.os, "dup2", lambda *_: None)
+    monkeypatch.setattr(loop_process, "_SILENCE_S", 0.05)
     made.words = words
 
     def ends(outcome):
@@ -255,9 +258,10 @@ def test_the_last_process_of_a_run_becomes_its_guardian(orphaned):
 
 
 @pytest.mark.parametrize("why", ["safe", "guarded", "not started", "simulated"])
-def test_a_loop_ends_if_its_output_needs_no_guardian(orphaned, why):
+def test_a_loop_ends_if_its_output_needs_no_guardian(orphaned, monkeypatch, why):
     if why == "guarded":
-        orphaned.page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns() + 10**12)
+        beats = partial(orphaned.page.put, PageField.GUARDIAN_HEARTBEAT_NS)
+        monkeypatch.setattr(loop_process.time, "sleep", lambda s: beats(time.monotonic_ns()))
     elif why == "not started":
         orphaned.page.put(PageField.GO, 0)
     elif why == "simulated":

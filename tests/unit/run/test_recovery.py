@@ -12,7 +12,7 @@ from hilctl.loop.safe_output import LoopOutcome
 from hilctl.recording.reader import read
 from hilctl.run.control.client import status_of
 from hilctl.run.recovery import recover_dead_runs
-from hilctl.run.run_folder import dismiss, run_folder, runs
+from hilctl.run.run_folder import RunFolder, dismiss, run_folder, runs
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import (
     GuardianPhase,
@@ -130,13 +130,14 @@ def test_a_recording_is_completed_while_the_guardian_acts(dead):
     os.close(guardian.pop())
 
 
-def test_a_recording_is_left_to_a_loop_that_still_ramps(dead):
-    guardian = []
-    recording = dead(watching, holds=HOLDS, guardian=guardian)
+def test_a_recording_is_left_to_a_loop_that_still_ramps(dead, monkeypatch):
+    loops = [True]
+    monkeypatch.setattr(RunFolder, "loops", property(lambda run: loops[0]))
+    recording = dead(watching, holds=HOLDS)
     before = recording.read_bytes()
     assert recover_dead_runs() == []
     assert recording.read_bytes() == before
-    os.close(guardian.pop())
+    loops[0] = False
     assert len(recover_dead_runs()) == 1
 
 
