@@ -6,6 +6,8 @@ import os
 import select
 import time
 from collections.abc import Callable
+from io import FileIO
+from typing import TypeAlias
 
 import serial
 from serial.rs485 import RS485Settings
@@ -18,8 +20,10 @@ from hilctl_drivers.transport.port_identity import PortIdentity
 from hilctl_drivers.transport.resource_names import admit_others, refuse_to_others
 from hilctl_drivers.transport.stream_link import StreamLink
 
+_Port: TypeAlias = serial.Serial | FileIO
 
-def _open_port(path: str, settings: SerialLineSettings, timeout_s: float) -> serial.Serial:
+
+def _open_port(path: str, settings: SerialLineSettings) -> serial.Serial:
     """Open and lock a port with all settings.
 
     Levels are set before opening. pyserial then applies them first, so a level that the system
@@ -34,7 +38,6 @@ def _open_port(path: str, settings: SerialLineSettings, timeout_s: float) -> ser
         timeout=0.0,
         xonxoff=settings.flow == "xonxoff",
         rtscts=settings.flow == "rts_cts",
-        write_timeout=timeout_s,
         exclusive=True,
     )
     if settings.dtr is not None:
@@ -53,6 +56,21 @@ def _open_port(path: str, settings: SerialLineSettings, timeout_s: float) -> ser
             port.close()
             raise
     return port
+
+
+def _open_again(path: str, settings: SerialLineSettings) -> _Port:
+    """Open a port of a run for the safe value.
+
+    pyserial takes five descriptors. If this process lacks them, one must do, without a lock: the
+    system keeps the settings of a port.
+    """
+    try:
+        return _open_port(path, settings)
+    except OSError as error:
+        if error.errno not in {errno.EMFILE, errno.ENFILE}:
+            raise
+    flags = os.O_RDWR | os.O_NOCTTY | os.O_NONBLOCK
+    return FileIO(path, "r+", opener=lambda path, _: os.open(path, flags))
 
 
 def _keep_levels(fd: int) -> None:
@@ -86,7 +104,7 @@ class SerialLink(StreamLink):
     ) -> None:
         super().__init__(settings.silence_s, timeout_s, clock, sleep, echo=settings.removes_echo)
         self._settings = settings
-        self._port: serial.Serial | None = None
+        self._port: _Port | None = None
         self._exclusive = False
         # Before the first opening: the guardian opens the port only after a run has failed.
         self._identity = PortIdentity(port)
@@ -97,16 +115,16 @@ class SerialLink(StreamLink):
         try:
             # Not the path: a link may be moved in between.
             file = self._identity.device_file()
-            port = _open_port(file, self._settings, self.timeout_s)
+            self._port = port = (_open_port if boot else _open_again)(file, self._settings)
         except (OSError, ValueError) as error:
             text = reason(error, PORT_REMEDIES) if isinstance(error, OSError) else str(error)
             if self._settings.rs485 is not None and isinstance(error, ValueError):
                 text += " (omit rs485 if the adapter switches its direction itself)"
             raise LostError(f"can't be opened: {text}") from None
         # Otherwise an FTDI adapter holds bytes back for up to 16 ms; ptys and USB CDC refuse it.
-        with contextlib.suppress(OSError, ValueError, NotImplementedError):
-            port.set_low_latency_mode(True)
-        self._port = port
+        if isinstance(port, serial.Serial):
+            with contextlib.suppress(OSError, ValueError, NotImplementedError):
+                port.set_low_latency_mode(True)
         self._use(port.fileno())
         if boot:
             self._exclusive = refuse_to_others(self._fd, file)
@@ -114,16 +132,11 @@ class SerialLink(StreamLink):
             self._sleep(self._settings.boot_wait_s)
         self._quiet_at = self._clock()
 
-    def _send(self, data: bytes | bytearray) -> None:
-        assert self._port is not None
-        try:
-            self._port.write(data)
-        except serial.SerialTimeoutException:
-            raise self._timed_out() from None
-
     def _discard_unsent(self) -> None:
-        assert self._port is not None
-        self._port.reset_output_buffer()
+        import termios
+
+        with contextlib.suppress(termios.error):  # the port is gone
+            termios.tcflush(self._fd, termios.TCOFLUSH)
 
     def _nothing_read(self) -> None:
         if dict(self._poll.poll(0)).get(self._fd, 0) & ~select.POLLIN:
@@ -135,16 +148,13 @@ class SerialLink(StreamLink):
 
     def close(self) -> None:
         """Close and unlock the port."""
-        port, self._port, self._fd = self._port, None, -1
-        if port is None:
+        if self._port is None:
             return
         if self._stale and self._settings.flow != "none":
             # Closing waits for bytes that a pausing device never takes, 30 s and more.
-            import termios
-
-            with contextlib.suppress(termios.error):  # where the port is gone
-                port.reset_output_buffer()
+            self._discard_unsent()
         if self._exclusive:
-            admit_others(port.fileno())
+            admit_others(self._fd)
             self._exclusive = False
+        port, self._port, self._fd = self._port, None, -1
         port.close()

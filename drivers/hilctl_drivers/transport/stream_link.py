@@ -9,6 +9,7 @@ import select
 import time
 from abc import ABC, abstractmethod
 from collections.abc import Callable
+from contextlib import suppress
 from functools import partial
 from os import read, write
 
@@ -171,15 +172,21 @@ class StreamLink(ABC):
         """Assume that bytes of an older exchange can still come, until the line was silent."""
         self._stale = True
 
-    @abstractmethod
     def _send(self, data: bytes | bytearray) -> None:
         """Send all, or raise NoAnswerError if that takes longer than the timeout."""
+        deadline = self._clock() + self.timeout_s
+        room = select.poll()
+        room.register(self._fd, select.POLLOUT)
+        late = False
+        while data:
+            if late or not room.poll(wait_ms(deadline, self._clock())):
+                raise NoAnswerError(f"could not send within {self.timeout_s:g} s")
+            late = self._clock() > deadline
+            with suppress(BlockingIOError):
+                data = data[write(self._fd, data) :]
 
     def _discard_unsent(self) -> None:  # noqa: B027  an unread TCP stream is closed soon
         """Discard bytes that wait to be sent."""
-
-    def _timed_out(self) -> NoAnswerError:
-        return NoAnswerError(f"could not send within {self.timeout_s:g} s")
 
     def _failed(self, error: OSError | DeviceError) -> DeviceError:
         """Return the error to raise, and protect the next request from late bytes."""

@@ -215,15 +215,6 @@ class TcpStream(_Connection, StreamLink):
         if boot:
             self._stale = True
 
-    def _send(self, data: bytes | bytearray) -> None:
-        assert self._socket is not None
-        try:
-            self._socket.sendall(data)
-        except TimeoutError as error:
-            if error.errno is None:  # otherwise the kernel has given the connection up
-                raise self._timed_out() from None
-            raise
-
     def _nothing_read(self) -> None:
         self.close()
         raise LostError("connection closed by the device")

@@ -1,16 +1,18 @@
 """How a serial port is set at opening: modem lines, flow control, and long replies."""
 
+import errno
 import fcntl
 import os
 import struct
 import termios
+from unittest.mock import Mock
 
 import pytest
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.transport import stream_link
-from hilctl_drivers.transport.links import NoAnswerError
+from hilctl_drivers.transport.links import LostError, NoAnswerError
 from hilctl_drivers.transport.serial_port import SerialLink
 from tests.unit.drivers.transport.conftest import (
     QUICK_S,
@@ -102,8 +104,11 @@ def test_time_spent_on_sending_is_not_there_for_the_answer(line, monkeypatch):
             assert ms == 0, "waited after the deadline"
             return []
 
-    monkeypatch.setattr(stream_link, "write", lambda _fd, _data: 0)
-    monkeypatch.setattr(link._port, "write", lambda _data: now.__setitem__(0, 2.0))
+    def write(_fd, data):
+        now[0] += 0.75
+        return len(data) if now[0] > 1.0 else 0
+
+    monkeypatch.setattr(stream_link, "write", write)
     monkeypatch.setattr(link, "_poll", Never())
     with pytest.raises(NoAnswerError, match="within 1 s"):
         link.transact(b"ask", lambda got: 10 - len(got), 10)
@@ -192,6 +197,23 @@ def test_a_value_is_sent_past_a_line_that_never_falls_silent(line):
     assert link.is_open
     assert not link.is_in_step
     link.close()
+
+
+def test_one_descriptor_is_enough_for_the_safe_value(line, monkeypatch):
+    """Opening with all settings needs five; the run has set them."""
+    master, name = line
+    serial(name).close()
+    settings = termios.tcgetattr(master)
+    link = SerialLink(name, line_settings(), QUICK_S)
+    monkeypatch.setattr(os, "pipe", Mock(side_effect=OSError(errno.EMFILE, "Too many")))
+    with pytest.raises(LostError, match="Too many"):
+        link.open()
+    link.open(boot=False)
+    with answering(master, REPLY):
+        assert link.transact(b"ask", missing, len(REPLY)) == REPLY
+    link.close()
+    assert not link.is_open
+    assert termios.tcgetattr(master) == settings
 
 
 def test_opening_waits_for_a_boot_unless_it_must_not(line):
