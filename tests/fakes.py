@@ -484,12 +484,17 @@ def logged(path: Path) -> list[dict]:
     return [json.loads(line) for line in lines]
 
 
+def children_of(process: int) -> list[int]:
+    """Return the ids of a process's children."""
+    children = Path(f"/proc/{process}/task/{process}/children")
+    return [int(child) for child in children.read_text().split()]
+
+
 def loop_of(supervisor: int) -> int:
     """Return the process id of a run's loop process."""
-    children = Path(f"/proc/{supervisor}/task/{supervisor}/children")
-    for child in children.read_text().split():
+    for child in children_of(supervisor):
         if b"hilctl.run.loop_process" in Path(f"/proc/{child}/cmdline").read_bytes():
-            return int(child)
+            return child
     raise AssertionError("the run has no loop process")
 
 

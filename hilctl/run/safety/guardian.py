@@ -37,6 +37,7 @@ from hilctl.loop.safe_output import (
     SafeGoal,
     SafeOutput,
 )
+from hilctl.machine.reserve import RESERVE
 from hilctl.machine.rt_setup import be_ordinary, be_quick
 from hilctl.machine.syscalls import LinuxProcess
 from hilctl.run.job import Job, SilenceLimits
@@ -143,16 +144,14 @@ class SafeAction:
         self._result = SafeActionResult(hung, "unknown", self._output.error, final=False)
         self._ending = threading.Event()
         self.failed = ""
-        # A daemon, so that a device that blocks forever does not keep the process alive.
-        self._thread = threading.Thread(target=self._run, name="safe action", daemon=True)
-        self._thread.start()
+        self._ended = RESERVE.run(self._run)
 
     def _run(self) -> None:
         output = self._output
         try:
             self._prepare()
             while not output.final and not self._ending.is_set():
-                output.attempt()
+                self._attempt()
                 self._result = SafeActionResult(
                     self._hung, output.state, output.error, output.final
                 )
@@ -165,21 +164,27 @@ class SafeAction:
         except Exception as error:  # noqa: BLE001  every error leaves the output unconfirmed
             self.failed = f"{type(error).__name__}: {error}"
 
+    def _attempt(self) -> None:
+        try:
+            self._output.attempt()
+        except LocalError:
+            if not RESERVE.release():
+                raise
+
     def result(self, wait_s: float = 0.0) -> SafeActionResult:
         """Return the result so far, after ``wait_s`` or as soon as it is final."""
-        self._thread.join(wait_s)
+        self._ended.wait(wait_s)
         return self._result
 
     @property
     def is_over(self) -> bool:
         """Whether nothing more is written: the result is final, it failed or was ended."""
-        return not self._thread.is_alive()
+        return self._ended.is_set()
 
     def end(self, wait_s: float) -> bool:
         """Stop writing; return whether the last write ends within ``wait_s``."""
         self._ending.set()
-        self._thread.join(wait_s)
-        return not self._thread.is_alive()
+        return self._ended.wait(wait_s)
 
 
 class Guardian:
@@ -327,6 +332,7 @@ def main(words: list[str]) -> int:
         # After the text, which readers expect in this phase.
         page.put(PageField.GUARDIAN_PHASE, GuardianPhase.FAILED)
         return 1
+    RESERVE.hold()
     "localhost".encode("idna")  # import the codec now, not at the first connection
     process = LinuxProcess()
     _stay_in_memory(process)

@@ -17,6 +17,7 @@ from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.safe_output import PATIENCE_S
+from hilctl.machine.reserve import RESERVE
 from hilctl.machine.rt_setup import be_ordinary, be_quick
 from hilctl.run.job import safe_priority, silence_limits
 from hilctl.run.processes import GuardianProcess, LoopProcess
@@ -60,6 +61,7 @@ class SafetyMonitor:
         self._patience_ns = round(1e9 * (PATIENCE_S + way / limits.ramp_per_s))
         self._priority = safe_priority(checked)
         self._watch = HangWatch(ring.page, silence_limits(checked), lambda: is_stopped(child.pid))
+        RESERVE.hold()
         self._start_guardian, self._record_event = start_guardian, record_event
         self._guardian = start_guardian(child.pid) if start_guardian else None
         self._started_ns: int | None = None
@@ -110,7 +112,8 @@ class SafetyMonitor:
             self._acted_ns = now_ns
             be_quick(self._priority)
             try:
-                self._stand_in()
+                with suppress(RuntimeError):  # no thread can be started: retried at the next poll
+                    self._stand_in()
             finally:
                 be_ordinary()
         by, result = self._reached()

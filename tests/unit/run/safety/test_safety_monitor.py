@@ -1,12 +1,14 @@
 """Who makes the output safe: the guardian where it can, the supervisor where it can't."""
 
 from types import SimpleNamespace
+from unittest.mock import Mock
 
 import pytest
 
 from hilctl.base.errors import DeviceError, RunError
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.safe_output import LoopOutcome
+from hilctl.run.safety import guardian as actions
 from hilctl.run.safety import safety_monitor as module
 from hilctl.run.safety.guardian import LAST_CALL_MS
 from hilctl.run.safety.safety_monitor import SafetyMonitor
@@ -225,6 +227,24 @@ def test_if_no_guardian_can_be_started_the_supervisor_goes_on_until_the_user_end
     unconfirmed.error = unconfirmed.error if ended else None
     assert not unconfirmed.safety.close(lambda: ended)
     assert unconfirmed.safety.result.confirmed != ended
+
+
+@pytest.mark.parametrize("how", ["descriptors", "thread"])
+def test_run_ends_if_no_process_can_act(run, monkeypatch, how):
+    """The output is unknown, after the patience of a device that does not answer."""
+    monkeypatch.setattr(module, "_HAND_OVER_S", 0.0)
+    run.guardians[0].ended, run.fail_start = True, OSError(24, "Too many open files")
+    run.error = MemoryError()
+    if how == "thread":
+        monkeypatch.setattr(actions.RESERVE, "run", Mock(side_effect=RuntimeError("no thread")))
+    run.look(ended=True)
+    while run.safety._action is not None and not run.safety._action.failed:
+        run.safety._action.result(wait_s=5.0)
+    run.look(ended=True, passed_ms=1000)
+    assert run.safety.result is None
+    run.look(ended=True, passed_ms=5_000)
+    assert (run.safety.result.output, run.safety.result.final) == ("unknown", False)
+    assert not run.safety.close()
 
 
 def test_if_no_process_can_act_the_run_ends(unconfirmed, monkeypatch):

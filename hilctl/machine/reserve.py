@@ -1,0 +1,80 @@
+"""A thread and descriptors, held for the safe value: it must be written when there are no more."""
+
+import os
+import sys
+from collections.abc import Callable
+from contextlib import suppress
+from queue import SimpleQueue
+from threading import Event, Semaphore, Thread
+
+_DESCRIPTORS = 8
+"""Opening a serial port takes six."""
+
+
+class Reserve:
+    """What a process holds until it lacks it: one per process, see :data:`RESERVE`."""
+
+    def __init__(self) -> None:
+        self._held = False
+        self._descriptors: list[int] = []
+        self._work: SimpleQueue[tuple[Callable[[], object], Event]] = SimpleQueue()
+        self._idle = Semaphore(0)
+
+    def hold(self) -> None:
+        """Take the reserve, unless it was taken; raise OSError or RuntimeError if that fails."""
+        if self._held:
+            return
+        import resource  # noqa: F401  so that release() finds it imported; other systems lack it
+
+        self._descriptors = [os.open(os.devnull, os.O_RDONLY) for _ in range(_DESCRIPTORS)]
+        # A new thread would need memory. A daemon, so that a blocked one does not keep the process.
+        Thread(target=self._serve, name="reserve", daemon=True).start()
+        self._held = True
+
+    def run(self, work: Callable[[], object]) -> Event:
+        """Call ``work`` in the held thread; in a new one if that is busy, or not held.
+
+        Return an event that is set afterwards. Raise RuntimeError if no thread can be started.
+        """
+        ended = Event()
+        if self._idle.acquire(blocking=False):
+            self._work.put((work, ended))
+        else:
+            Thread(target=_call, args=(work, ended), name="safe action", daemon=True).start()
+        return ended
+
+    def release(self) -> bool:
+        """Free descriptors, standard input too; return False if that was done, or none was held.
+
+        A limit below the numbers in use refuses all numbers from there on, whatever was closed. So
+        it is raised as far as allowed, and standard input frees number 0, below any limit.
+        """
+        if not self._descriptors:
+            return False
+        import resource
+
+        for kind in (resource.RLIMIT_NOFILE, resource.RLIMIT_AS):
+            with suppress(OSError, ValueError):
+                hard = resource.getrlimit(kind)[1]
+                resource.setrlimit(kind, (hard, hard))
+        own_input = [] if sys.__stdin__ is None else [0]
+        while spare := self._descriptors or own_input:
+            with suppress(OSError):
+                os.close(spare.pop())
+        return True
+
+    def _serve(self) -> None:
+        while True:
+            self._idle.release()
+            _call(*self._work.get())
+
+
+def _call(work: Callable[[], object], ended: Event) -> None:
+    try:
+        work()
+    finally:
+        ended.set()
+
+
+RESERVE = Reserve()
+"""The reserve of this process."""

@@ -1,0 +1,13 @@
+"""A reserve that is never held: each action has a thread of its own, and tests keep their input."""
+
+import pytest
+
+from hilctl.machine.reserve import Reserve
+from hilctl.run.safety import guardian
+
+
+@pytest.fixture(autouse=True)
+def _no_reserve(monkeypatch):
+    made = Reserve()
+    monkeypatch.setattr(made, "hold", lambda: None)
+    monkeypatch.setattr(guardian, "RESERVE", made)
