@@ -9,6 +9,7 @@ last reply has come, and the line is drained after a timeout.
 import math
 from abc import abstractmethod
 from collections.abc import Callable, Sequence
+from dataclasses import replace
 from pkgutil import resolve_name
 from typing import Any, ClassVar
 
@@ -205,9 +206,12 @@ class SteppedDac(WiredDac):
         return self._setup.session_class.feed_time(self._profile)
 
     def _connect(self) -> None:
-        """Connect and check that the devices are the right ones."""
+        """Connect, check that the devices are the right ones, and note errors of before."""
         self._link.open()
         self._writer.check_selftest()
+        if errors := self._writer.old_errors():
+            details = {**self._info.details, "earlier_errors": "; ".join(errors)}
+            self._info = replace(self._info, details=details)
         self._reader.open()
 
     def _set_digital(self, high: bool) -> None:

@@ -43,7 +43,7 @@ def probe(path: Path, settings: list[str]) -> Probed:
         max_rate_hz=info.max_rate_hz,
         rate_note=info.rate_note,
         safe_note=info.safe_note,
-        details=dict(info.details),
+        details=dict(loaded.device.info.details),
         displacement_um=displacement_um,
         output=output,
         measured=None if math.isnan(measured) else measured,

@@ -165,7 +165,9 @@ class AsciiDac(SteppedDac, SerialDac):
         if readback != "none":
             self._check_read_back(value, self._target.value(self._writer.number(readback)))
         elif self._profile.error_query != "none":
-            self._writer.check_errors()
+            if self._writer.old_errors():  # of this value, or of an older command
+                self._write(value)
+                self._writer.check_errors()
         elif not answered:
             raise UnconfirmedError(f"the value was sent, but {_NO_EVIDENCE}")
 

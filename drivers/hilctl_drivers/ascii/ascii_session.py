@@ -55,6 +55,8 @@ from hilctl_drivers.transport.wire_time import WireTime
 _SCPI_INFINITY = 9.9e37
 """SCPI-1999 sends this for infinity and 9.91e37 for not a number."""
 
+_ERRORS_MAX = 50
+"""More than a device's queue holds; one that reports its state has no queue."""
 _CHECKSUMS = {"none": lambda _text: b"", "dcon": dcon_checksum, "gen": gen_checksum}
 _CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?", re.ASCII)
@@ -321,6 +323,21 @@ class AsciiSession:
             text, reply = self._ask(query)
             if not query.match(reply):
                 raise RefusedError(f"{text} says {reply}", reply)
+
+    def old_errors(self) -> list[str]:
+        """Take the errors of earlier sessions out of the device; return its replies.
+
+        Raise RefusedError if it still has errors after as many queries as no queue has places.
+        """
+        found: list[str] = []
+        while (query := self.profile.error_query) != "none":
+            text, reply = self._ask(query)
+            if query.match(reply):
+                break
+            found.append(reply)
+            if len(found) == _ERRORS_MAX:
+                raise RefusedError(f"{text} says {reply}, {_ERRORS_MAX} times", reply)
+        return found
 
     def check_selftest(self) -> None:
         """Run the self-test; raise DeviceError if it is another device."""

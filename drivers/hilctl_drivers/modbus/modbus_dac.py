@@ -129,7 +129,7 @@ class ModbusDac(ModbusDevice):
         check = self._writer.error_check()
         if check is None:
             return swap
-        check()  # a refused init step, or an error of before
+        check()  # a refused init step, or an error of before that only an init step clears
 
         def checked(data: bytes) -> float:
             found = swap(data)

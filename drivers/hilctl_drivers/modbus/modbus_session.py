@@ -330,6 +330,15 @@ class ModbusSession:
         """Return whether a digital input is not 0."""
         return any(self.read_bytes(source))
 
+    def old_errors(self) -> list[str]:
+        """Return the content of the error register if it is not 0, which reading it may clear."""
+        try:
+            if (check := self.error_check()) is not None:
+                check()
+        except RefusedError as error:
+            return [str(error)]
+        return []
+
     def error_check(self) -> Callable[[], None] | None:
         """Return a function that raises RefusedError if the error register is not 0, if any."""
         register = self.profile.error_register

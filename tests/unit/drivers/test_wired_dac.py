@@ -7,8 +7,11 @@ from pathlib import Path
 
 import numpy as np
 import pytest
+import yaml
 
 from hilctl.base.errors import DeviceError, InputError
+from hilctl.base.yaml import dump
+from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.wired_dac import SerialDac, SerialOptions
 from tests.fakes import made_safe
 from tests.unit.drivers.conftest import TIMEOUT_S
@@ -183,6 +186,31 @@ def test_scpi_supply_is_set_up_and_checked(rig):
     bench.emulator.device.refusal(b"")  # leaves an error to be asked for
     with pytest.raises(DeviceError, match=r"SYST:ERR\? says -200"):
         bench.device.close()
+
+
+def test_errors_of_an_earlier_session_end_no_run(rig):
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
+    for _ in range(3):
+        bench.emulator.device.refusal(b"")
+    bench.open()
+    assert bench.device.info.details["earlier_errors"].count("-200") == 3
+    bench.exchange(2.5)
+    bench.device.close()
+
+
+def test_older_errors_do_not_prevent_a_confirmation(rig, tmp_path):
+    """Without a read-back, only a query of errors confirms a value."""
+    data = yaml.safe_load(shipped_profiles()["kepco_bop"].read_text(encoding="utf-8"))
+    data["outputs"]["current"]["readback"] = "none"
+    path = tmp_path / "supply.yaml"
+    path.write_text(dump(data), encoding="utf-8")
+    bench = rig(str(path), reader="agilent_34970a", own_line=True)
+    bench.open()
+    bench.exchange(2.5)
+    for _ in range(3):
+        bench.emulator.device.refusal(b"")
+    bench.device.make_safe(0.0)
+    assert bench.current_a() == pytest.approx(0.0, abs=1e-3)
 
 
 @pytest.mark.parametrize(("profile", "current_a"), [("kepco_bop", 2.5), ("tdk_lambda_gen", 3.0)])

@@ -52,6 +52,14 @@ def test_a_value_is_put_in_and_a_number_comes_out():
     assert asked.link.sent == [b"#020\r"]
 
 
+def test_error_that_no_query_clears_is_refused():
+    """A device that reports a state, not a queue."""
+    asked = session(*[b"-350\n"] * 1000, profile=load_profile("pi_e727"))
+    with pytest.raises(links.RefusedError):
+        asked.old_errors()
+    assert len(asked.link.sent) < 1000
+
+
 @pytest.mark.parametrize(("reply", "error", "said"), [
     (b"?\r", links.RefusedError, r"#020: out of range \(\?\)"),
     (b"?02\r", links.RefusedError, "invalid command"),

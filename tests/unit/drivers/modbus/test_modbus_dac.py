@@ -384,6 +384,22 @@ class TestErrorRegister:
             rig.open()
         assert rig.current_a == pytest.approx(0.0)
 
+    def test_error_of_before_that_reading_clears_is_noted(self, rig, monkeypatch):
+        device = rig.emulated.device
+        device.write("holding", 6, b"\0\5")
+        read = device.read
+
+        def read_and_clear(areas, address, count):
+            found = read(areas, address, count)
+            if address == 6:
+                device.write("holding", 6, bytes(2))
+            return found
+
+        monkeypatch.setattr(device, "read", read_and_clear)
+        rig.open()
+        assert "0x5" in rig.device.info.details["earlier_errors"]
+        rig.exchange(1.0)
+
     def test_emulator_reports_a_value_out_of_range_there(self, rig):
         device = rig.emulated.device
         device.write("holding", 0, bytes.fromhex("4130 0000"))  # 11 V
