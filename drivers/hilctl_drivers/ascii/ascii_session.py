@@ -372,10 +372,7 @@ class AsciiSession:
         """
         reply = self._transact(text, example)
         if reply == text:
-            raise MismatchError(
-                f"{text}: came back unchanged: the line echoes what is sent; set echo: true "
-                "beside the address if the device answers after that"
-            )
+            raise _came_back(text)
         return reply
 
     def _transact(self, text: str, example: str) -> str:
@@ -438,8 +435,17 @@ def _lines(text: str) -> int:
     return text.count("\n") + 1
 
 
+def _came_back(text: str) -> MismatchError:
+    return MismatchError(
+        f"{printable(text)}: came back unchanged: the line echoes what is sent; set echo: true "
+        "beside the address if the device answers after that"
+    )
+
+
 def _matched(text: str, forms: Sequence[Reply], reply: str) -> re.Match[str]:
     found = next(filter(None, (form.match(reply) for form in forms)), None)
+    if found is None and reply == text:
+        raise _came_back(text)
     if found is None:
         raise MismatchError(f"{printable(text)}: not an answer to this: {reply!r}")
     return found

@@ -122,9 +122,11 @@ def _rtu_call(session: "ModbusSession", pdu: bytes) -> Call:
                     crc = table[crc ^ word]
                 if crc == sent:
                     return read
-        if adu.startswith(request):
+        lacking = missing(adu)
+        # The reply may be shorter than the request: then it ends before the echo does.
+        if adu.startswith(request if lacking else request[: len(adu)]):
             raise CorruptError(ECHOED)
-        if lacking := missing(adu):
+        if lacking:
             raise IncompleteError(f"{lacking} more bytes belong to the reply")
         return session.read_data(request[1:-2], modbus.rtu_pdu(adu, unit))
 

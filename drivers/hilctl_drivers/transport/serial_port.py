@@ -129,7 +129,12 @@ class SerialLink(StreamLink):
         if boot:
             self._exclusive = refuse_to_others(self._fd, file)
             self._stale = True
-            self._sleep(self._settings.boot_wait_s)
+            boot_wait_s = self._settings.boot_wait_s
+            self._silent_hint = (
+                "; if opening the port resets the device, set boot_wait_s to the time until it "
+                f"answers (now {boot_wait_s:g} s)"
+            )
+            self._sleep(boot_wait_s)
         self._quiet_at = self._clock()
 
     def _discard_unsent(self) -> None:

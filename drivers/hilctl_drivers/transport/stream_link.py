@@ -15,6 +15,7 @@ from os import read, write
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.transport.links import (
+    ECHOED,
     CorruptError,
     LostError,
     Missing,
@@ -85,6 +86,7 @@ class StreamLink(ABC):
         self._count_waiting: Callable[[], object] = lambda: None
         self._stale = True
         self._quiet_at = 0.0
+        self._silent_hint = ""  # why there may be no answer; empty after the first one
 
     @property
     def is_open(self) -> bool:
@@ -142,11 +144,12 @@ class StreamLink(ABC):
             if usual and self._poll.poll(self._timeout_ms):
                 reply = read(self._fd, _FIRST)
                 if len(reply) != usual:
-                    reply = self._complete(bytearray(reply), missing, deadline)
+                    reply = self._complete(request, bytearray(reply), missing, deadline)
             else:
-                reply = self._complete(bytearray(), missing, deadline)
+                reply = self._complete(request, bytearray(), missing, deadline)
         except (OSError, DeviceError) as error:
             raise self._failed(error) from None
+        self._silent_hint = "" if reply else self._silent_hint
         if self._gap_s:
             self._quiet_at = self._clock() + self._gap_s
         return reply[len(request) :] if self._echo else reply
@@ -210,11 +213,15 @@ class StreamLink(ABC):
         if early_s > 0.0:
             self._sleep(early_s)
 
-    def _complete(self, reply: bytearray, missing: Missing, deadline: float) -> bytearray:
+    def _complete(
+        self, request: bytes | bytearray, reply: bytearray, missing: Missing, deadline: float
+    ) -> bytearray:
         late = False
         while wanted := missing(reply):
             if late or not self._poll.poll(wait_ms(deadline, self._clock())):
-                raise NoAnswerError(cut(len(reply), wanted, self.timeout_s))
+                only_echo = reply.startswith(request) and not self._echo
+                hint = f": {ECHOED}" if only_echo else self._silent_hint
+                raise NoAnswerError(cut(len(reply), wanted, self.timeout_s) + hint)
             late = self._clock() > deadline
             reply += self._read()
         return reply

@@ -131,6 +131,11 @@ def test_an_echo_must_be_what_was_sent():
         session(b"#030\r>\r", profile=profile).ask("#020", GOOD)
 
 
+def test_command_that_comes_back_in_place_of_its_reply_is_an_echo():
+    with pytest.raises(links.MismatchError, match="echo: true"):
+        session(b"#020\r").ask("#020", GOOD)
+
+
 LINES = Reply(pattern=r"1=([0-9.]+) \n2=[0-9.]+", example="1=0.5 \n2=0.25")
 
 

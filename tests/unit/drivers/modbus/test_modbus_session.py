@@ -543,6 +543,15 @@ def test_local_echo_of_an_adapter_is_named(case):
             made.answered(lambda request, tail=tail: request + tail)
 
 
+@pytest.mark.parametrize("pdu", [read_pdu(4, 0, 1), write_pdu(9, NEW)])
+def test_start_of_an_echo_is_named(pdu):
+    """The reply is shorter than the request, so the exchange ends before the echo does."""
+    size = reply_size(pdu) + 3
+    call = session_on(AnsweringLink(lambda request: request[:size]), "rtu").prepare(pdu)
+    with pytest.raises(links.CorruptError, match="echo"):
+        call()
+
+
 def test_an_echo_as_long_as_the_reply_is_named():
     """Two registers are written, six are read: 17 bytes each."""
     call = session_on(AnsweringLink(bytes), "rtu").prepare(write_read_pdu(0, 6, 9, NEW))

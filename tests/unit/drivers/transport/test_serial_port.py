@@ -15,6 +15,7 @@ from hilctl_drivers.transport import stream_link
 from hilctl_drivers.transport.links import LostError, NoAnswerError
 from hilctl_drivers.transport.serial_port import SerialLink
 from tests.unit.drivers.transport.conftest import (
+    PATIENT_S,
     QUICK_S,
     REPLY,
     answering,
@@ -223,4 +224,24 @@ def test_opening_waits_for_a_boot_unless_it_must_not(line):
     assert slept == []
     link.open()
     assert slept == [2.0]
+    link.close()
+
+
+def test_first_silence_after_opening_may_be_a_boot(line):
+    """The key is named until the device has answered."""
+    master, name = line
+    link = serial(name, QUICK_S)
+
+    def silence():
+        with pytest.raises(NoAnswerError) as caught:
+            link.transact(b"ask", missing)
+        return str(caught.value)
+
+    assert "boot_wait_s" in silence()
+    assert os.read(master, 100) == b"ask"
+    link.timeout_s = PATIENT_S
+    with answering(master, REPLY):
+        link.transact(b"ask", missing, len(REPLY))
+    link.timeout_s = QUICK_S
+    assert "boot_wait_s" not in silence()
     link.close()

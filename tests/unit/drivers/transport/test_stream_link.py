@@ -120,6 +120,11 @@ def test_an_echo_that_was_not_expected_is_named():
             link.transact(b"ask", missing)
 
 
+def test_an_echo_without_an_answer_is_named():
+    with stream(answering(b"ask"), QUICK_S) as link, pytest.raises(NoAnswerError, match="echo"):
+        link.transact(b"ask", missing)
+
+
 def test_the_end_of_a_connection_is_one_line():
     with (
         stream(lambda connection: connection.recv(3)) as link,
