@@ -15,6 +15,7 @@ from dataclasses import replace
 from datetime import UTC, datetime
 from functools import partial
 from pathlib import Path
+from queue import SimpleQueue
 
 import numpy as np
 
@@ -55,7 +56,10 @@ class Recorder:
         self.adapted: Mapping[str, float] = {}
         """Values of the last event of adaptation."""
         self._failed = self._problem = ""
-        self._noting: threading.Thread | None = None
+        self._states: SimpleQueue[DeviceState | None] = SimpleQueue()
+        # Its disk may hang; that of the recording must not wait for it. One thread, because a new
+        # one at the end of the run could lack memory.
+        self._noting = threading.Thread(target=self._write_states, name="device state", daemon=True)
         self.next_sample = self._flushed = 0
         self._checked = checked
         self._unix_ns = steady_unix_ns()
@@ -113,7 +117,7 @@ class Recorder:
     def note_device(self, coil: CoilState | None = None) -> None:
         """Start to write the device state, with the coil at the end: this is its last run."""
         facts, info = self._run.facts, self._checked.loaded.device.info
-        path, now, earlier = self.path, MachineTime.now(), self._noting
+        path, now = self.path, MachineTime.now()
         with suppress(OSError):  # the working folder was removed
             path = path.absolute()
         if not (names := names_of(info)):
@@ -128,19 +132,19 @@ class Recorder:
             boot_s=now.boot_s + (self._longest_s() if coil is None else 0.0),
             coil=coil,
         )
+        self._states.put(state)
+        if self._noting.ident is None:
+            self._noting.start()
 
-        def write() -> None:
-            if earlier is not None:
-                earlier.join()
-            write_state(state)
-
-        # Its disk may hang; that of the recording must not wait for it.
-        self._noting = threading.Thread(target=write, name="device state", daemon=True)
-        self._noting.start()
+    def _write_states(self) -> None:
+        with suppress(MemoryError):  # the state of the start remains: it is unknown
+            while (state := self._states.get()) is not None:
+                write_state(state)
 
     def await_noted(self, timeout_s: float = _PATIENCE_S) -> None:
-        """Wait until the device state is written, or warn that it cannot be."""
-        if self._noting is not None:
+        """Wait until the last device state is written, or warn that it cannot be."""
+        self._states.put(None)
+        if self._noting.is_alive():
             self._noting.join(timeout_s)
             if self._noting.is_alive():
                 _log.warning("the state of the device is not written yet: its disk hangs")
@@ -232,9 +236,9 @@ class Recorder:
                 thermal_time_constant_s=limits.thermal_time_constant_s,
             )
             self.note_device(coil)
-            self.await_noted(patience_s)
         else:
             self._file.stream.abandon()
+        self.await_noted(patience_s)
         return closed
 
     def _closed(self) -> bool:

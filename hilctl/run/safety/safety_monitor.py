@@ -150,7 +150,7 @@ class SafetyMonitor:
         prepare = partial(be_quick, self._priority)
         self._action = SafeAction(page, self._device, goal, hung=self._hung, prepare=prepare)
         if self._start_guardian is not None and (guardian is None or guardian.ended):
-            with suppress(OSError):  # no memory or descriptors: it is tried again
+            with suppress(OSError, MemoryError):  # it is tried again
                 self._guardian = self._start_guardian("act")
 
     def _guardian_acts(self, now_ns: int) -> bool:

@@ -154,7 +154,8 @@ def test_the_state_of_the_device_names_the_run_and_how_it_ended(checked, tmp_pat
     made = Recorder(checked, tmp_path / "run.mcap", overwrite=False)
     made.begin(10**18, {})
     made.note_device()
-    made.await_noted()
+    while not last_runs(real.info):
+        pass
     (begun,) = (run.state for run in last_runs(real.info))
     run_id = read_ends(made.path).run["run_id"]
     assert (begun.run_id, begun.recording, begun.coil) == (run_id, str(made.path), None)
