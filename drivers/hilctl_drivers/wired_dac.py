@@ -21,6 +21,7 @@ from hilctl_drivers.device import DacDevice
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, Measure
 from hilctl_drivers.transport.links import Link
 from hilctl_drivers.transport.safe_exchange import SafeExchange, check_read_back
+from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.wire_time import WireTime, check_feeds
 
@@ -97,6 +98,16 @@ class WiredDac(DacDevice):
         ticks = check_feeds(self._options.watchdog_timeout_s, ticks_per_s)
         self._feed_every = ticks if has != "none" and has.kick == "strict" else 0
         self._ticks = 0
+
+    @property
+    def port_identity(self) -> str:
+        """See :class:`hilctl.base.device.PortDevice`; empty on TCP."""
+        return self._link.identity.known if isinstance(self._link, SerialLink) else ""
+
+    @port_identity.setter
+    def port_identity(self, known: str) -> None:
+        if isinstance(self._link, SerialLink):
+            self._link.identity.known = known
 
     @property
     def reading_age_s(self) -> float:

@@ -348,6 +348,18 @@ class ReadableDevice(Protocol):
         ...
 
 
+@runtime_checkable
+class PortDevice(Protocol):
+    """A device on a port whose path may lead to another device later.
+
+    Attributes:
+        port_identity: The device that the path led to at first; empty if there was none. A process
+            that is started later sets it, and writes nothing to another one.
+    """
+
+    port_identity: str
+
+
 class DigitalDevice(Protocol):
     """A device with digital channels for triggers.
 

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 
 import numpy as np
 
-from hilctl.base.device import Device
+from hilctl.base.device import Device, PortDevice
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.types import F64
@@ -65,6 +65,7 @@ class Job:
     supervisor: int
     silence_s: float
     safe_priority: int
+    port_identity: str = ""
 
     @classmethod
     def of(
@@ -79,6 +80,7 @@ class Job:
     ) -> Self:
         """Return the job of a checked experiment, and write its arrays into the run's folder."""
         loaded, begun = checked.loaded, checked.begun
+        device = loaded.device
         reference = input_um = folder.path / "reference.npy"
         _save(reference, checked.reference.values)
         if begun.input_um is not checked.reference.values:
@@ -108,6 +110,7 @@ class Job:
             supervisor=supervisor,
             silence_s=silence_s,
             safe_priority=safe_priority(checked),
+            port_identity=device.port_identity if isinstance(device, PortDevice) else "",
         )
 
     def write(self, path: Path) -> None:
@@ -132,6 +135,8 @@ class Job:
         made = made_device(self.document(), Path(self.folder), TextFiles(self.files))
         if made is None:
             raise InputError("the experiment has no device")
+        if self.port_identity and isinstance(made, PortDevice):
+            made.port_identity = self.port_identity
         return made
 
     def arrays(self) -> tuple[F64, F64]:

@@ -189,10 +189,14 @@ def on_a_port(tmp_path, emulate, run, profile):
     return start
 
 
-def test_the_guardian_writes_nothing_to_another_device(on_a_port, tmp_path, profile):
-    """A link that leads to another board by now: its output is not ours."""
+@pytest.mark.parametrize("resumed", [False, True])
+def test_the_guardian_writes_nothing_to_another_device(on_a_port, tmp_path, profile, resumed):
+    """A link that leads to another board by now, also for a guardian started while it was gone."""
     _, port, started = on_a_port("--fault", f"unplug@{PULLED_AT}", link=True)
     assert started.end()["guardian_active"]
+    if resumed:
+        experiment = started.output.with_suffix(".yaml")
+        assert said("safe", experiment, code=3)["guardian_active"]
     (tmp_path / "other").mkdir()
     other = Emulated(tmp_path / "other", profile("rtu_module"), "--current-a", "2.0")
     try:

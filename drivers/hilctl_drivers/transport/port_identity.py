@@ -24,7 +24,8 @@ class PortIdentity:
 
     def __init__(self, path: str) -> None:
         self._path = path
-        self._known = ""
+        self.known = ""
+        """The device; empty before one was there."""
         self._pty = -1
         with suppress(OSError):
             self.device_file()
@@ -39,16 +40,16 @@ class PortIdentity:
         file = os.path.realpath(self._path)
         device = Path(file).stat().st_rdev
         found = usb_adapter(device) or f"device {os.major(device)}:{os.minor(device)}"
-        if not self._known:
+        if not self.known:
             if os.major(device) in PTY_MAJORS:
                 # Not opened for use. Its count of links becomes 0 when the pseudo-terminal ends.
                 self._pty = os.open(file, os.O_PATH)
                 finalize(self, os.close, self._pty)
-            self._known = found
+            self.known = found
         ended = self._pty >= 0 and not os.fstat(self._pty).st_nlink
-        if ended or found != self._known:
+        if ended or found != self.known:
             raise LostError(
-                f"another device is at this port now ({found} instead of {self._known}"
+                f"another device is at this port now ({found} instead of {self.known}"
                 f"{', which has ended' if ended else ''}): "
                 "name the port by its link in /dev/serial/by-id, which stays with the device"
             )

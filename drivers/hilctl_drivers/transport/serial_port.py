@@ -107,14 +107,14 @@ class SerialLink(StreamLink):
         self._port: _Port | None = None
         self._exclusive = False
         # Before the first opening: the guardian opens the port only after a run has failed.
-        self._identity = PortIdentity(port)
+        self.identity = PortIdentity(port)
 
     def open(self, *, boot: bool = True) -> None:
         """Open and lock the port, see :meth:`StreamLink.open`."""
         self.close()
         try:
             # Not the path: a link may be moved in between.
-            file = self._identity.device_file()
+            file = self.identity.device_file()
             self._port = port = (_open_port if boot else _open_again)(file, self._settings)
         except (OSError, ValueError) as error:
             text = reason(error, PORT_REMEDIES) if isinstance(error, OSError) else str(error)

@@ -94,6 +94,19 @@ def test_device_that_comes_later_is_the_first(new_pty, link, tmp_path):
         port.device_file()
 
 
+def test_process_that_starts_later_takes_the_identity_of_the_first(new_pty, link, tmp_path):
+    """A guardian that is started while the device is gone must not accept what comes next."""
+    first, other = new_pty(), new_pty()
+    known = PortIdentity(first.path).known
+    port = PortIdentity(str(tmp_path / "port"))
+    port.known = known
+    link(other.path)
+    with pytest.raises(LostError, match="another device"):
+        port.device_file()
+    link(first.path)
+    assert port.device_file() == first.path
+
+
 USB = {"idVendor": "0403", "idProduct": "6001", "serial": "A1"}
 
 
