@@ -15,7 +15,7 @@ from hilctl.base.types import F64, U32
 from hilctl.experiment.device_state import begin
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.identify.data.records import SteadyLoop
-from hilctl.loop.interlocks import InterlockContext, InterlockSettings
+from hilctl.loop.interlocks import AuxLimit, InterlockContext, InterlockSettings
 from hilctl.models.base import HysteresisModel
 from hilctl.run.assemble import assemble
 from hilctl.run.unpaced import run_in_memory
@@ -120,7 +120,10 @@ class TrialDevice:
         plan = replace(
             assemble(loaded, *values, paced=False),
             # Evaluate inaccurate models, too, instead of stopping them.
-            interlocks=InterlockContext(stroke_um=(-math.inf, math.inf)),
+            interlocks=InterlockContext(
+                stroke_um=(-math.inf, math.inf),
+                aux=tuple(AuxLimit(each) for each in loaded.device.info.aux),
+            ),
             interlock_settings=InterlockSettings(),
             feedback=None,
         )
