@@ -1,4 +1,4 @@
 """Real-time set-up and diagnosis of this computer."""
 
-PUBLIC = ("diagnosis", "procfs", "rt_setup", "syscalls", "timer_latency")
+PUBLIC = ("diagnosis", "procfs", "reserve", "rt_setup", "syscalls", "timer_latency")
 """Modules that other rooms import; the others are private."""

@@ -122,9 +122,9 @@ class RunFolder:
 
     def keep(self, *, recorded: bool) -> None:
         """Keep the folder after the supervisor, for an output or samples that are not safe yet."""
-        if recorded:
-            (self.path / _RECORDED).touch()
-        (self.path / _KEPT).touch()
+        # Folders, because a process without free descriptors can create no files.
+        for mark in (_RECORDED, _KEPT) if recorded else (_KEPT,):
+            (self.path / mark).mkdir(exist_ok=True)
 
     @property
     def kept(self) -> bool:

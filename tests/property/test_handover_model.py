@@ -22,7 +22,7 @@ CODE = {
     "guardian.watch": "hilctl.run.safety.guardian:Guardian.watch",
     "guardian.act": "hilctl.run.safety.guardian:Guardian.act",
     "guardian.attempt": "hilctl.loop.safe_output:SafeOutput.attempt",
-    "guardian.release_device": "hilctl.run.safety.guardian:Guardian._release_device",
+    "guardian.release_locks": "hilctl.run.safety.guardian:Guardian._release_locks",
     "guardian.await_device": "hilctl.run.safety.guardian:Guardian._awaits_device",
     "supervisor.keep_guardian": "hilctl.run.safety.safety_monitor:SafetyMonitor._keep_guardian",
     "supervisor.stand_in": "hilctl.run.safety.safety_monitor:SafetyMonitor._stand_in",
@@ -148,7 +148,7 @@ def guardian_steps(s):
         final = done.said == "confirmed"
         yield "guardian.attempt", done.to(guardian="done", known=False) if final else done
     if s.guardian == "act" and s.claim:
-        yield "guardian.release_device", s.to(guardian="wait", lock="none", claim=False)
+        yield "guardian.release_locks", s.to(guardian="wait", lock="none", claim=False)
     if s.guardian == "wait":
         stands_in = s.supervisor == "stand in"
         if s.relieved:

@@ -139,6 +139,7 @@ class SafeAction:
         hung: bool,
         prepare: Callable[[], object] = lambda: None,
     ) -> None:
+        self._device = device
         self._output = SafeOutput(device, goal, on_write=page.note_safe_write)
         self._hung, self._prepare = hung, prepare
         self._result = SafeActionResult(hung, "unknown", self._output.error, final=False)
@@ -185,6 +186,13 @@ class SafeAction:
         """Stop writing; return whether the last write ends within ``wait_s``."""
         self._ending.set()
         return self._ended.wait(wait_s)
+
+    def release_device(self, beat: Callable[[], object] = lambda: None) -> None:
+        """Stop writing, which may take the device's timeout, and close the device."""
+        while not self.end(_WAIT_S):
+            beat()
+        with suppress(Exception):  # the next process opens it anew
+            self._device.close()
 
 
 class Guardian:
@@ -246,10 +254,9 @@ class Guardian:
             if self._is_final(action):
                 action.end(0.0)
                 break
-            while not action.end(_WAIT_S):
-                self._beat()
+            action.release_device(self._beat)
             if page.get(PageField.CLAIM):
-                self._release_device()
+                self._release_locks()
         page.put(PageField.GUARDIAN_PHASE, GuardianPhase.DONE)
 
     def _end(self, number: int, frame: FrameType | None) -> None:
@@ -281,10 +288,9 @@ class Guardian:
     def _supervised(self) -> bool:
         return os.getppid() == self._job.supervisor
 
-    def _release_device(self) -> None:
-        """Close the device and release its locks, for the command that claims it."""
+    def _release_locks(self) -> None:
+        """Release the locks of the device, for the command that claims it."""
         page = self._page
-        self._device.close()
         page.put(PageField.GUARDIAN_PHASE, GuardianPhase.WAITING)
         page.put(PageField.CLAIM, 0)
         self._locks.release()

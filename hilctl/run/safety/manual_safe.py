@@ -8,7 +8,8 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.errors import ConfigError, ConfigProblem, RunError
+from hilctl.base.device import Device
+from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import load_document
 from hilctl.experiment.devices import made_device
@@ -79,7 +80,7 @@ def put_safe(
     with ExitStack() as stack:
         # Refused while a run holds the device: its loop would overwrite the safe value.
         _acquire(stack, info.holds, relief)
-        stack.callback(device.close)
+        stack.callback(_close, device)
         _drive(output, clock, sleep)
         if output.final:
             relief.relieve()
@@ -115,6 +116,14 @@ def _acquire(stack: ExitStack, holds: Sequence[str], relief: GuardianRelief) -> 
         relief.acquire(stack.enter_context(DeviceLocks(holds, take_over=True)))
     except RunError as error:  # such as a full /dev/shm: the output must become safe nevertheless
         _log.warning("%s: the safe value is written anyway", error)
+
+
+def _close(device: Device) -> None:
+    """Close a device; an error changes nothing in what it has confirmed."""
+    try:
+        device.close()
+    except HilctlError as error:
+        _log.warning("%s", error)
 
 
 def _drive(output: SafeOutput, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:

@@ -235,7 +235,5 @@ class SafetyMonitor:
 
     def _release(self, action: SafeAction) -> None:
         """Stop writing, and leave the device to the guardian that waits for it."""
-        while not action.end(_POLL_S):
-            pass  # the last write ends after the timeout of the device
-        self._device.close()
+        action.release_device()
         self._page.put(PageField.STANDS_IN, 0)

@@ -133,7 +133,7 @@ def left(tmp_path):
             folder.keep(recorded=recorded)
             held.extend(os.dup(each) for each in own if guarded)
         if not kept:
-            (folder.path / "kept").unlink()
+            (folder.path / "kept").rmdir()
         return folder, page
 
     yield leave
