@@ -125,7 +125,8 @@ class SafeOutput:
             # Not with its first write, because the safe ramp must not wait for it.
             cast(DigitalDevice, device).safe_command = goal.value
         self._clock, self._on_write = clock, on_write
-        self._pending = goal.pending
+        self.pending = goal.pending
+        """Whether an older command without an answer may still be executed."""
         self._began_s: float | None = None
         self._sends = 0
         self.pause_s = 0.0
@@ -163,14 +164,14 @@ class SafeOutput:
             self.state, self.error = "unknown", str(error)
             self.pause_s = _RETRY_S if passed_s <= PATIENCE_S else max(_LATER_RETRY_S, least_s)
             # The device may execute this command later, after the next one.
-            self._pending |= value != self._goal.value
+            self.pending |= value != self._goal.value
             return
         if value != self._goal.value:
             self.state, self.error, self.pause_s = "unknown", "on the safe ramp", _RAMP_S
             return
         self.error, self.pause_s = "", max(_REPEAT_S, least_s)
         if confirmed:
-            self.state = "set" if self._pending else "confirmed"
+            self.state = "set" if self.pending else "confirmed"
         else:
             self._sends += 1
             self.state = "sent"

@@ -139,8 +139,8 @@ class SafeAction:
         hung: bool,
         prepare: Callable[[], object] = lambda: None,
     ) -> None:
-        self._device = device
-        self._output = SafeOutput(device, goal, on_write=page.note_safe_write)
+        self._device, self._page = device, page
+        self._output = SafeOutput(device, goal, on_write=partial(_note_write, page, goal.value))
         self._hung, self._prepare = hung, prepare
         self._result = SafeActionResult(hung, "unknown", self._output.error, final=False)
         self._ending = threading.Event()
@@ -171,6 +171,8 @@ class SafeAction:
         except LocalError:
             if not RESERVE.release():
                 raise
+        finally:
+            self._page.put(PageField.UNANSWERED, int(self._output.pending))
 
     def result(self, wait_s: float = 0.0) -> SafeActionResult:
         """Return the result so far, after ``wait_s`` or as soon as it is final."""
@@ -193,6 +195,13 @@ class SafeAction:
             beat()
         with suppress(Exception):  # the next process opens it anew
             self._device.close()
+
+
+def _note_write(page: SharedPage, safe_value: float, value: float) -> None:
+    """Leave to the next process where the ramp is, and that a command is without an answer."""
+    page.note_safe_write(value)
+    if value != safe_value:
+        page.put(PageField.UNANSWERED, 1)
 
 
 class Guardian:
@@ -317,10 +326,10 @@ def safe_goal(ring: SampleRing, device: Device, value: float, ramp_per_s: float)
     if start is None:
         start = ring.last_command()
     # A loop that ended without a confirmed output lost its device in an exchange.
-    unanswered = page.get(PageField.EXCHANGING) or page.get(PageField.PHASE) == Phase.ENDED
+    lost = page.get(PageField.EXCHANGING) or page.get(PageField.PHASE) == Phase.ENDED
     if info.simulated:  # each process has its own simulation
         return SafeGoal(value, ramp_per_s, None, pending=False)
-    return SafeGoal(value, ramp_per_s, start, bool(unanswered))
+    return SafeGoal(value, ramp_per_s, start, bool(lost or page.get(PageField.UNANSWERED)))
 
 
 def main(words: list[str]) -> int:

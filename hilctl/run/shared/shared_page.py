@@ -103,6 +103,7 @@ class PageField(IntEnum):
     CLAIM = 81
     RELIEVED = 82
     STANDS_IN = 83
+    UNANSWERED = 84
 
 
 class Phase(IntEnum):

@@ -324,6 +324,23 @@ def test_a_claimed_device_is_driven_again_if_the_other_command_ends(guarded, cla
     assert values[-1] == 0.25
 
 
+def test_a_step_of_the_ramp_without_an_answer_is_remembered_after_a_claim(guarded, claimed):
+    """It may still be executed, so that the output is set and not confirmed."""
+    claimed.then, claimed.ends = lambda: None, True
+    guarded.page.put_float(PageField.OUTPUT_AT_START, 1.25)
+    make_safe, values = guarded.device.make_safe, []
+
+    def ending(value):
+        values.append(value)
+        if values.count(0.25) == 2:
+            os.kill(os.getpid(), signal.SIGTERM)
+        make_safe(value)
+
+    guarded.device.make_safe = ending
+    guarded.guard()
+    assert guarded.page.safe_result() == SafeActionResult(False, "set", "", final=False)
+
+
 def test_a_run_that_took_over_from_another_user_is_protected_after_a_claim(guarded, monkeypatch):
     """The other user's process has the name of the device when the guardian acts again."""
     device, make_safe, release = guarded.device, guarded.device.make_safe, DeviceLocks.release
