@@ -237,7 +237,7 @@ class GuardianRelief:
     def restart(self) -> None:
         """Start the guardians again that have died; they act when the device is free."""
         for run, page in self._pages:
-            if not run.alive and run.kept:
+            if not run.alive:
                 try:
                     with locked_run(run) as lock:
                         GuardianProcess(run, page, [lock], "wait")

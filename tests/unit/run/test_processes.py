@@ -125,15 +125,13 @@ def left(tmp_path):
     """Return a function that leaves a run of a device without supervisor and loop."""
     held = []
 
-    def leave(*, guarded=True, recorded=True, kept=True, holds=(HOLDS,)):
+    def leave(*, guarded=True, recorded=True, holds=(HOLDS,)):
         with run_folder("sine", tmp_path / "a.mcap", 1.0, holds) as (folder, own):
             page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
             page.put(PageField.GO, 1)
             page.put(PageField.RECORDED, recorded)
             folder.keep(recorded=recorded)
             held.extend(os.dup(each) for each in own if guarded)
-        if not kept:
-            (folder.path / "kept").rmdir()
         return folder, page
 
     yield leave
@@ -216,7 +214,6 @@ def test_runs_of_other_devices_keep_their_guardians(left):
 def test_dead_guardians_are_started_again_with_the_lock_of_their_run(left, monkeypatch, caplog):
     dead, _ = left(guarded=False)
     left()
-    left(guarded=False, kept=False)
     started = []
 
     def start_process(*words, inherits, stderr):
