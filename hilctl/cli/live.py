@@ -27,12 +27,13 @@ from hilctl.live.server_process import SingleRun, serve_runs
 from hilctl.run.control.client import (
     JOB_CONTROL,
     MAX_MARK,
+    active_runs,
     find_run,
     mark_run,
     request_stop,
     set_run,
 )
-from hilctl.run.run_folder import RunFolder, require_linux, runs
+from hilctl.run.run_folder import RunFolder, require_linux
 
 _FRAME_S, _SEARCH_S, _OVER_S = 0.15, 0.05, 0.5
 _LINE_FRAMES, _OTHER_LINES = 7, 6  # lines of the screen that are not events
@@ -67,7 +68,7 @@ def main() -> None:
     with safe_streams():
         while not run and os.getppid() == supervisor:
             time.sleep(_SEARCH_S)
-            own = (each for each in runs() if each.card.supervisor == supervisor)
+            own = (each for each in active_runs() if each.card.supervisor == supervisor)
             run = next((each for each in own if each.description.exists()), None)
         if run:
             try:

@@ -201,16 +201,18 @@ class FoxgloveServer:
         now_s = time.monotonic()
         self._feeds.update(now_s)
         feed = self._feeds.feed(None)
+        if feed is not self._shown:
+            if self._shown is not None:
+                self._server.clear_session()  # discards client data of another run
+            self._shown, self._topics = feed, None
         if feed is None:
             return
         feed.poll(now_s)
-        if feed is not self._shown and feed.start_ns:
-            start_unix_ns = time.time_ns() - round(now_s * 1e9) + feed.start_ns
-            if self._shown is not None:
-                self._server.clear_session()  # discards client data of another run
-            self._shown, self._topics = feed, LiveTopics(feed, start_unix_ns)
         if self._topics is None:
-            return
+            if not feed.start_ns:
+                return
+            start_unix_ns = time.time_ns() - round(now_s * 1e9) + feed.start_ns
+            self._topics = LiveTopics(feed, start_unix_ns)
         wanted = [topic for topic in SCOPE_TOPICS if self._channels[topic].has_sinks()]
         messages = [*self._topics.scope(wanted), *self._topics.events()]
         if number % _STATUS_FRAMES == 0:

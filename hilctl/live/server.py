@@ -35,7 +35,7 @@ from websockets.headers import parse_subprotocol
 from websockets.http11 import Request, Response
 from websockets.typing import Subprotocol
 
-from hilctl.base.errors import HilctlError, InputError
+from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl.base.formatting import finite_json, printable
 from hilctl.base.strict import StrictModel, first_problem
@@ -61,10 +61,12 @@ class PageMessage(StrictModel):
     """Message of a page; its number is returned with the answer.
 
     ``view`` changes the :class:`PageView`, ``stop`` stops the run, ``report`` makes the report of
-    its recording, ``run`` sends a request to the run's control socket.
+    its recording, ``run`` sends a request to the run's control socket. They concern the named run,
+    by default the one of the view.
     """
 
     id: int
+    run: str | None = None
     ask: Literal["view", "stop", "report", "run"]
     view: dict[str, Any] = Field(default_factory=dict)
     request: dict[str, Any] = Field(default_factory=dict)
@@ -85,6 +87,8 @@ class PageSession:
         clock: Callable[[], float] = time.monotonic,
     ) -> None:
         self.view = PageView()
+        self.run: str | None = None
+        """Run of the last status, empty if there was none; None before the first status."""
         self._connection, self._answer, self._clock = connection, answer, clock
         self._sending: asyncio.Task[None] | None = None
         self._began_s = 0.0
@@ -308,15 +312,16 @@ class LiveServer:
             return answer_text(message, ok=False, error=str(error))
 
     async def _executed(self, viewer: PageSession, message: PageMessage) -> dict[str, Any]:
-        feed = self._feeds.feed(viewer.view.run)
+        feed = self._feeds.feed(message.run or viewer.view.run)
         if message.ask == "view":
             return {"ok": True}
         if feed is None:
             raise InputError("no such active run")
         if message.ask == "stop":
-            # Without a supervisor its loop ramps down by itself.
             requested = request_stop(feed.folder)
-            return {"ok": requested or not feed.folder.alive, "requested": requested}
+            if not requested and feed.folder.alive:
+                raise RunError("its supervisor is gone; its loop ramps down by itself")
+            return {"ok": True, "requested": requested, "run": feed.folder.card.name}
         if message.ask == "report":
             return {"ok": True, "path": await self._report(Path(feed.folder.card.recording))}
         answer = await asyncio.to_thread(ask, feed.folder.socket, message.request, _REQUEST_S)
@@ -359,11 +364,14 @@ class LiveServer:
         frames: dict[tuple[str, str, float], bytes] = {}
         for viewer in [each for each in self._viewers if each.ready]:
             shown, view = self._feeds.feed(viewer.view.run), viewer.view
-            status = [] if number % _STATUS_FRAMES else [self._status(shown)]
+            # A frame never precedes the status of its run.
+            name = shown.folder.card.name if shown is not None else ""
+            due = number % _STATUS_FRAMES == 0 or viewer.run != name
+            status, viewer.run = [self._status(shown)] if due else [], name
             if shown is None:
                 viewer.offer(*status)
                 continue
-            key = (shown.folder.card.name, view.mode, nearest_window_s(view.window_s))
+            key = (name, view.mode, nearest_window_s(view.window_s))
             if key not in frames:
                 frames[key] = frame_of(shown.scope, view.mode, key[2])
             viewer.offer(*status, frames[key])

@@ -20,6 +20,7 @@ import shutil
 import socket
 import struct
 import sys
+from collections import Counter
 from collections.abc import Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass
@@ -59,7 +60,7 @@ _BACKLOG = 1000  # connections that query the holder of a device; never accepted
 class RunCard:
     """Identity of a run, for other commands."""
 
-    name: str  # name of its folder, unique among the runs of a user
+    name: str  # name of its folder, unique among the runs of a user; a process never reuses it
     experiment: str
     recording: str
     supervisor: int
@@ -282,16 +283,21 @@ def _clear_away(folder: RunFolder) -> None:
         folder.remove()
 
 
+_names: Counter[Path] = Counter()
+
+
 def _new_folder(path: Path) -> Path:
-    """Create a folder; a kept one of the same name may exist."""
-    number, made = 1, path
+    """Create a folder whose name no run of this process had: clients may still know that run.
+
+    A kept folder of the same name may exist.
+    """
     while True:
-        try:
+        _names[path] += 1
+        number = _names[path]
+        made = path.with_name(f"{path.name}-{number}") if number > 1 else path
+        with suppress(FileExistsError):
             made.mkdir(mode=0o700)
             return made
-        except FileExistsError:
-            number += 1
-            made = path.with_name(f"{path.name}-{number}")
 
 
 class DeviceLocks:

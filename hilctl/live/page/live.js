@@ -24,6 +24,9 @@ const view = { run: new URLSearchParams(location.search).get("run"), mode: "cycl
 const scope = { trigger: "cycle", frozen: false, zoom: null, at: null, anchor: null, hidden: new Set(), ranges: new Map() };
 let socket = null;
 let status = null;
+let live = false; // whether the status is a present one
+let saidMs = 0;
+let noReport = "";
 let frame = null;
 let shown = null; // what the scope shows
 let drawn = 0;
@@ -40,7 +43,7 @@ function connect() {
   }
   socket = new WebSocket(`ws://${location.host}/live`, [PROTOCOL, `token.${token}`]);
   socket.binaryType = "arraybuffer";
-  socket.onopen = () => { notice(""); ask("view", { view }); };
+  socket.onopen = () => ask("view", { view });
   socket.onmessage = (message) => {
     if (typeof message.data === "string") said(JSON.parse(message.data));
     else frame = message.data;
@@ -48,16 +51,17 @@ function connect() {
   socket.onclose = () => {
     socket = null;
     for (const [id] of waiting) answered({ id, ok: false, error: "the server of the page has ended" });
-    if (!over()) {
-      notice("No connection to the server of the page. The run is still active: stop it with hilctl stop.");
-      badge("lost", "no connection");
-    }
+    lost("no connection");
     setTimeout(connect, 1000);
   };
 }
 
-function over() {
-  return status !== null && status.ended;
+// The last status does not describe the present: another run may be active.
+function lost(what) {
+  live = false;
+  badge("lost", what);
+  if (status?.ended) showEnd();
+  else notice(`No status from the server of the page (${what}). The run may still be active: stop it with hilctl stop.`);
 }
 
 function element(tag, content = [], more = {}) {
@@ -83,8 +87,22 @@ function answered(answer) {
 }
 
 function said(message) {
-  if (message.kind === "answer") answered(message);
-  else { status = message; showStatus(); }
+  if (message.kind === "answer") { answered(message); return; }
+  if (status?.run !== message.run) forget();
+  else if (!live) notice("");
+  [status, live, saidMs] = [message, true, performance.now()];
+  showStatus();
+}
+
+// Nothing of one run is shown beside another.
+function forget() {
+  notice("");
+  say("");
+  $("stop").replaceChildren("STOP ", element("kbd", "Esc"));
+  for (const id of ["gain", "offset"]) delete $(id).dataset.touched;
+  if (scope.frozen) freeze();
+  frame = shown = scope.zoom = scope.anchor = null;
+  noReport = "";
 }
 
 // ---- text and numbers
@@ -98,6 +116,7 @@ function notice(text, kind = "bad") {
 function badge(kind, text) {
   $("state").dataset.kind = kind;
   $("state").textContent = text;
+  document.title = status?.run ? `${text} · ${status.run}` : "hilctl";
 }
 
 function say(text, kind = "good") {
@@ -128,12 +147,16 @@ function unit(kind) {
 
 function showStatus() {
   showRuns();
-  if (!status.description) {
+  const { description } = status;
+  for (const part of ["main", "footer"]) document.querySelector(part).hidden = !description;
+  $("stop").disabled = Boolean(status.ended);
+  if (!description) {
     badge("lost", "no active run");
+    $("name").textContent = "hilctl";
+    $("clock").textContent = $("segment").textContent = "";
+    $("done").value = 0;
     return;
   }
-  const { description } = status;
-  document.title = `${status.state} · ${status.run}`;
   $("name").textContent = description.name;
   badge(status.state, status.state);
   $("clock").textContent = `${time(status.t_s)} of ${time(status.total_s)}`;
@@ -144,15 +167,21 @@ function showStatus() {
     ? `${bytes(status.disk.recorded_bytes)} recorded, ${bytes(status.disk.free_bytes)} free on disk · ` : "";
   $("room").textContent = `${disk}ring ${(100 * status.ring_used).toFixed(0)} % full · `
     + `${status.missed_samples} samples not shown`;
-  $("stop").disabled = status.ended;
   $("report").hidden = !status.ended;
-  if (status.ended) notice(`Run ended: ${status.reason || status.state}${safeText()}`, endKind());
+  if (status.ended) showEnd();
   showFigures();
   showGauges();
   showControls();
   showEvents();
   showKeys();
   drawSmall();
+}
+
+function showEnd() {
+  const others = status.runs.map((run) => run.name).filter((name) => name !== status.run).join(", ");
+  const later = live ? others && ` Active now: ${others}.` : " The page has no connection since then, and shows no later run.";
+  const kind = later && endKind() === "good" ? "calm" : endKind();
+  notice(`${status.run} ended: ${status.reason || status.state}${safeText()}${later}${noReport}`, kind);
 }
 
 function endKind() {
@@ -162,7 +191,7 @@ function endKind() {
 
 function safeText() {
   if (status.safe === null) return "";
-  return status.safe ? ". Output at its safe value, confirmed." : ". The output is NOT known to be safe: look at it.";
+  return status.safe ? ". Its output was then at its safe value, confirmed." : ". Its output was NOT known to be safe: look at it.";
 }
 
 function showRuns() {
@@ -719,20 +748,24 @@ function stop() {
   $("stop").textContent = "STOP …";
   notice("STOP requested, not yet acknowledged.");
   ask("stop", {}, (answer) => {
-    $("stop").textContent = answer.ok ? "STOP ✓" : "STOP";
-    if (answer.ok) notice("STOP acknowledged: the run ramps to its safe value.", "calm");
+    $("stop").textContent = "STOP";
+    if (answer.ok && answer.run !== status?.run) return;
+    if (answer.ok) $("stop").textContent = "STOP ✓";
+    if (answer.ok) notice(`STOP acknowledged: ${answer.run} ${answer.requested ? "ramps to its safe value" : "has already ended"}.`, "calm");
     else notice(`STOP is NOT acknowledged: ${answer.error}. Use hilctl stop or the emergency switch of the rig.`);
   });
 }
 
 function report() {
   const tab = open("", "_blank"); // now: browsers block a tab that is opened later
+  const { run } = status;
   $("report").disabled = true;
-  ask("report", {}, (answer) => {
+  ask("report", { run }, (answer) => {
     $("report").disabled = false;
     if (answer.ok) { tab.location = answer.path; return; }
     tab.close();
-    notice(`No report: ${answer.error}`);
+    noReport = ` No report of ${run}: ${answer.error}`;
+    notice(noReport);
   });
 }
 
@@ -755,8 +788,10 @@ function showChange() {
 }
 
 function request(command, what) {
+  const run = status?.run;
   say(`${what} …`);
-  ask("run", { request: command }, (answer) => {
+  ask("run", { run, request: command }, (answer) => {
+    if (run !== status?.run) return;
     say(answer.ok ? `${what}: done` : `${what}: ${answer.error}`, answer.ok ? "good" : "bad");
     if (answer.ok) for (const id of ["gain", "offset"]) delete $(id).dataset.touched;
   });
@@ -851,6 +886,7 @@ function refresh(now) {
 let usualMs = 33;
 setInterval(() => {
   const old = performance.now() - lastFrameMs > FRESH_MS;
+  if (live && performance.now() - saidMs > FRESH_MS) lost("no data");
   $("rate").textContent = old ? "no new frames" : `${number(1000 / usualMs, 0, 2)} frames/s`;
 }, 1000);
 requestAnimationFrame(refresh);

@@ -254,7 +254,7 @@ def run(monkeypatch):
     made.feed.values["reason"] = "by hand"
     for name, value in {
         "find_run": lambda name: made,
-        "runs": lambda: [made],
+        "active_runs": lambda: [made],
         "RunReader": lambda folder: made.feed,
         "print_lines": lambda feed: None,
         "signal.signal": lambda *given: None,
@@ -283,7 +283,7 @@ def test_final_state_is_printed(run, monkeypatch, capsys):
 def test_subprocess_shows_the_run_of_its_parent(run, monkeypatch, capsys):
     other = SimpleNamespace(card=SimpleNamespace(name="x", supervisor=8))
     found = iter([[], [other], [other, run]])
-    monkeypatch.setattr(module, "runs", lambda: next(found))
+    monkeypatch.setattr(module, "active_runs", lambda: next(found))
     module.main()
     monkeypatch.setattr(module.os, "getppid", lambda: 1)
     module.main()

@@ -243,6 +243,37 @@ def test_client_decodes_all_topics(description, tmp_path, monkeypatch):
     assert json.loads(found["/diagnostics"][0][1]).keys() == shown.keys()
 
 
+def test_end_of_a_run_is_not_published_during_the_next_run(description, tmp_path):
+    """The next run may drive the output before its first sample."""
+    server = FoxgloveServer(first, port=0)
+    said = []
+    channel = SimpleNamespace(
+        has_sinks=lambda: True, log=lambda data, log_time: said.append(json.loads(data))
+    )
+    server._channels = {DIAGNOSTICS: channel} | dict.fromkeys(
+        MESSAGES, SimpleNamespace(has_sinks=lambda: False)
+    )
+
+    def shown():
+        said.clear()
+        server._feeds._looked_s = float("-inf")
+        server._show(0)
+        return {status["hardware_id"] for each in said for status in each["status"]}
+
+    try:
+        with active_run(description, tmp_path) as (one, ring):
+            ring.page.put(PageField.START_NS, 1)
+            assert shown() == {one.card.name}
+        server._feeds.feed(None).ended = True
+        assert shown() == {one.card.name}
+        with active_run(description, tmp_path) as (two, ring):
+            assert shown() == set()
+            ring.page.put(PageField.START_NS, 1)
+            assert shown() == {two.card.name}
+    finally:
+        server.run(lambda _: True)
+
+
 def test_port_in_use_is_an_error():
     server = FoxgloveServer(first, port=0)
     try:

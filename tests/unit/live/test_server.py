@@ -2,10 +2,13 @@
 
 import asyncio
 import json
+import os
 import re
 import shutil
 import socket
+import subprocess
 from contextlib import asynccontextmanager, suppress
+from pathlib import Path
 from unittest.mock import Mock
 
 import pytest
@@ -429,3 +432,178 @@ def test_slow_page_gets_the_newest_frame_and_is_disconnected():
         await asyncio.sleep(0.01)
 
     asyncio.run(slow())
+
+
+NODE = shutil.which("node")
+PAGE = Path(module.__file__).with_name("page") / "live.js"
+HARNESS = Path(__file__).with_name("page.mjs")
+
+
+def page_after(*steps):
+    """Return what the page shows after each step, and the messages that it has sent."""
+    if NODE is None:
+        assert "CI" not in os.environ
+        pytest.skip("node is not installed")
+    words = [NODE, str(HARNESS), str(PAGE)]
+    given = json.dumps([{"open": True}, *steps])
+    ran = subprocess.run(words, input=given, capture_output=True, text=True, check=False)
+    assert ran.returncode == 0, ran.stderr
+    answer = json.loads(ran.stdout)
+    return answer["found"][1:], answer["sent"]
+
+
+def status_at(description, run, *others, state="running", **more):
+    """Return a status of the server while other runs are active."""
+    active = [{"name": name} for name in (run, *others)]
+    values = {"ended": False, "reason": "", "safe": None, "t_s": 1.0, "total_s": 2.0} | more
+    lists = {"figures": {}, "aux": [], "gauges": [], "events": [], "lateness_us": {}}
+    return {"status": {
+        "run": run, "runs": active, "state": state, "segment": "", "recording": "a.mcap",
+        "disk": None, "ring_used": 0.0, "missed_samples": 0, "gain": 1.0, "offset": 0.0,
+        "inverse": "in", "description": description.model_dump(mode="json"), **lists, **values,
+    }}  # fmt: skip
+
+
+def ended(description, run, *others, safe=True):
+    end = {"state": "completed", "ended": True, "reason": "waveform completed", "safe": safe}
+    return status_at(description, run, *others, **end)
+
+
+def test_end_of_a_run_is_not_shown_with_the_next_run(description):
+    """Its notices, its answers and its frozen scope are those of one run."""
+    shown, sent = page_after(
+        ended(description, "sine-1"),
+        {"click": "freeze"},
+        status_at(description, "sine-2"),
+        {"click": "stop"},
+        {"answer": {"ok": True, "requested": True, "run": "sine-2"}},
+        status_at(description, "sine-3"),
+    )
+    first, _, second, asked, stopping, third = shown
+    assert (first["kind"], first["badge"]) == ("good", "completed")
+    assert "sine-1" in first["notice"]
+    assert (second["notice"], second["badge"], second["frozen"]) == ("", "running", False)
+    assert second["title"] == "running · sine-2"
+    assert sent[-1]["ask"] == "stop"
+    assert "sine-2" in stopping["notice"]
+    assert "✓" in stopping["stop"]
+    assert asked["notice"]
+    assert (third["notice"], "✓" in third["stop"]) == ("", False)
+
+
+def test_answer_on_a_run_is_not_shown_with_the_next_run(description):
+    shown, _ = page_after(
+        status_at(description, "sine-1"),
+        {"click": "stop"},
+        status_at(description, "sine-2"),
+        {"answer": {"ok": True, "requested": True, "run": "sine-1"}},
+    )
+    assert (shown[-1]["notice"], "✓" in shown[-1]["stop"]) == ("", False)
+
+
+def test_refused_stop_is_always_shown(description):
+    shown, _ = page_after(
+        status_at(description, "sine-1"),
+        {"click": "stop"},
+        status_at(description, "sine-2"),
+        {"answer": {"ok": False, "error": "no supervisor"}},
+    )
+    assert "no supervisor" in shown[-1]["notice"]
+    assert shown[-1]["kind"] == "bad"
+
+
+def test_requests_name_the_run_that_the_page_shows(description):
+    _, sent = page_after(status_at(description, "sine-1"), {"click": "report"})
+    assert (sent[-1]["ask"], sent[-1]["run"]) == ("report", "sine-1")
+
+
+def test_report_that_fails_stays_on_the_page(description):
+    shown, _ = page_after(
+        ended(description, "sine-1"),
+        {"click": "report"},
+        {"answer": {"ok": False, "error": "no recording"}},
+        ended(description, "sine-1"),
+        status_at(description, "sine-2"),
+    )
+    assert "no recording" in shown[-2]["notice"]
+    assert shown[-1]["notice"] == ""
+
+
+def test_end_of_a_run_names_the_runs_that_are_active(description):
+    """They may drive the same output."""
+    (shown,), _ = page_after(ended(description, "sine-1", "sine-2"))
+    assert "sine-2" in shown["notice"]
+    assert shown["kind"] == "calm"
+
+
+@pytest.mark.parametrize("loss", [{"close": True}, {"wait_ms": 5000}])
+def test_end_without_a_connection_is_not_a_present_state(description, loss):
+    """A server that has ended, or hangs, shows no later run."""
+    shown, _ = page_after(ended(description, "sine-1"), loss, ended(description, "sine-1"))
+    assert [each["kind"] for each in shown] == ["good", "calm", "good"]
+    assert shown[1]["badge"] not in {"completed", ""}
+    assert shown[1]["title"] != shown[0]["title"]
+
+
+def test_unsafe_end_stays_bad(description):
+    shown, _ = page_after(ended(description, "sine-1", "sine-2", safe=False), {"close": True})
+    assert [each["kind"] for each in shown] == ["bad", "bad"]
+
+
+def test_page_without_a_run_shows_nothing_of_the_last_one(description):
+    """As after a reconnect, when the server no longer knows the run."""
+    gone = {"status": {"runs": [{"name": "sine-2"}]}}
+    shown, _ = page_after(
+        ended(description, "sine-1"), {"close": True}, gone, status_at(description, "sine-2")
+    )
+    assert (shown[-2]["notice"], shown[-2]["main"], shown[-2]["name"]) == ("", False, "hilctl")
+    assert shown[-1]["main"]
+
+
+def test_status_of_a_run_precedes_its_first_frame(description, tmp_path, monkeypatch):
+    """Otherwise the page draws a run below the end of the one before."""
+    monkeypatch.setattr(module, "_STATUS_FRAMES", 10**9)
+
+    async def shown():
+        async with serving() as server, opened(server) as connection:
+            names = [(await status_of(connection)).get("run")]
+            with active_run(description, tmp_path) as (folder, _):
+                server._feeds.update(1e12)
+                while isinstance(message := await connection.recv(), bytes):
+                    assert names[-1]
+                names.append(json.loads(message)["run"])
+                assert isinstance(await connection.recv(), bytes)
+                return names, folder.card.name
+
+    names, name = asyncio.run(shown())
+    assert names == [None, name]
+
+
+def test_request_concerns_the_named_run(description, tmp_path, monkeypatch):
+    asked = []
+    monkeypatch.setattr(module, "ask", lambda path, *_: asked.append(path) or {})
+
+    async def answers():
+        async with serving() as server, opened(server) as connection:
+            await status_of(connection)
+            named = await answer_to(connection, ask="run", run=second.card.name)
+            return named, await answer_to(connection, ask="run", run="sine-0")
+
+    with active_run(description, tmp_path), active_run(description, tmp_path) as (second, _):
+        named, unknown = asyncio.run(answers())
+    assert (named["ok"], unknown["ok"]) == (True, False)
+    assert asked == [second.socket]
+
+
+def test_stop_without_a_supervisor_is_refused_with_its_reason(description, tmp_path, monkeypatch):
+    monkeypatch.setattr(module, "request_stop", lambda run: False)
+
+    async def pressed():
+        async with serving() as server, opened(server) as connection:
+            await status_of(connection)
+            return await answer_to(connection, ask="stop")
+
+    with active_run(description, tmp_path):
+        answer = asyncio.run(pressed())
+    assert not answer["ok"]
+    assert "supervisor" in answer["error"]

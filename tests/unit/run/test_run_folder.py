@@ -393,3 +393,12 @@ def test_runs_are_refused_before_the_file_is_read(monkeypatch, tmp_path):
         start_detached(absent, [], None, [])
     with pytest.raises(InputError, match=r"absent\.yaml"):  # an experiment can be checked
         checked_experiment(absent, [])
+
+
+def test_name_of_a_run_is_used_once(tmp_path):
+    """Clients that know an earlier run of this process must not take a later one for it."""
+    with made(tmp_path) as (first, _):
+        pass
+    with made(tmp_path) as (second, _):
+        assert second.card.name != first.card.name
+        assert (second.alive, first.alive) == (True, False)
