@@ -54,8 +54,8 @@ def calibrate_sensor(
     *,
     by: str,
     reference: str,
-    reading_column: Column = 1,
-    true_column: Column = 2,
+    reading_column: Column | None = None,
+    true_column: Column | None = None,
     overwrite: bool = False,
 ) -> CalibrationFit:
     """Fit the curve of a sensor to pairs of reading and true displacement, and write it.
@@ -65,17 +65,19 @@ def calibrate_sensor(
         output: Calibration file to write; its calibration of an amplifier is kept.
         by: Operator.
         reference: Reference instrument.
-        reading_column: Column of the readings without calibration: name, or number from 1.
-        true_column: Column of the true displacements.
+        reading_column: Column of the readings without calibration: name, or number from 1; None if
+            a name in the table has one of the words reading, sensor, indicated.
+        true_column: Column of the true displacements; None if a name has one of the words true,
+            reference, actual.
         overwrite: Replace the calibration of a sensor in the file.
 
     Raises:
-        InputError: The table is invalid, or the file cannot be written.
+        InputError: The table is invalid, points are outliers, or the file cannot be written.
     """
     file, origin = Path(output), Origin(datetime.now(UTC).date(), by, reference)
     before = existing_calibration(file, "sensor", overwrite=overwrite)
-    points = sensor_points(Path(table), (reading_column, true_column))
-    found = fit_sensor(str(table), *points, origin)
+    points = sensor_points(Path(table), reading_column, true_column)
+    found = fit_sensor(points, origin)
     write_calibration(file, found.fitted, before)
     return found
 

@@ -5,7 +5,7 @@ A curve is a table of points, so that readings are interpolated and never extrap
 
 from dataclasses import dataclass
 from datetime import date
-from typing import Annotated, Self, TypeAlias
+from typing import Annotated, Literal, Self, TypeAlias
 
 import numpy as np
 
@@ -15,6 +15,7 @@ from hilctl.base.types import F64, CommandUnit
 
 _POINTS = 1025  # of a polynomial: the error is below 1e-6 of the range
 _LEAST_RATIO, _MOST_RATIO = 0.5, 2.0  # beyond, a unit or a sensitivity is wrong
+GOOD_PERCENT, USABLE_PERCENT = 0.5, 2.0  # largest residual, of the calibrated range
 
 
 def _date(value: object) -> date:
@@ -44,6 +45,23 @@ class CalibrationOrigin(StrictModel):
     reference: str
     residual_rms: Annotated[float, Field(ge=0.0)]
     residual_max: Annotated[float, Field(ge=0.0)]
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Lowest and highest calibrated reading or command."""
+        raise NotImplementedError
+
+    @property
+    def residual_percent(self) -> float:
+        """Largest residual in percent of the calibrated range."""
+        return 100.0 * self.residual_max / (self.ends[1] - self.ends[0])
+
+    @property
+    def grade(self) -> Literal["good", "usable", "poor"]:
+        """Grade of the largest residual."""
+        if self.residual_percent > USABLE_PERCENT:
+            return "poor"
+        return "good" if self.residual_percent <= GOOD_PERCENT else "usable"
 
 
 class SensorCalibration(CalibrationOrigin):
@@ -86,6 +104,11 @@ class SensorCalibration(CalibrationOrigin):
         return self
 
     @property
+    def ends(self) -> tuple[float, float]:
+        """Lowest and highest calibrated reading in um."""
+        return self.range_um
+
+    @property
     def points(self) -> tuple[F64, F64]:
         """Reading and true displacement at points of the curve, float64[n] each."""
         if self.table is not None:
@@ -126,9 +149,16 @@ class AmplifierCalibration(CalibrationOrigin):
     @model_validator(mode="after")
     def _is_plausible(self) -> Self:
         low, high = self.range
+        if not low < high:
+            raise ValueError(f"range must rise, got [{low:g}, {high:g}]")
         if not abs(self.offset) <= high - low:
             raise ValueError(f"offset must be at most the width of the range, {high - low:g}")
         return self
+
+    @property
+    def ends(self) -> tuple[float, float]:
+        """Lowest and highest command of the calibration."""
+        return self.range
 
 
 class CalibrationFile(StrictModel):
@@ -144,10 +174,10 @@ class CalibrationFile(StrictModel):
         return self
 
     @property
-    def dates(self) -> dict[str, date]:
-        """Date of each calibration."""
+    def parts(self) -> dict[str, SensorCalibration | AmplifierCalibration]:
+        """The calibrations by their keys."""
         both = {"sensor": self.sensor, "amplifier": self.amplifier}
-        return {name: each.date for name, each in both.items() if each is not None}
+        return {name: each for name, each in both.items() if each is not None}
 
 
 @dataclass(frozen=True, slots=True)

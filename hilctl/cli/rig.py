@@ -56,15 +56,15 @@ def sensor(
     output: Output,
     by: By,
     reference: Annotated[str, typer.Option(metavar="TEXT", help="Reference instrument.")],
-    reading_column: TableColumn = "1",
-    true_column: TableColumn = "2",
+    reading_column: TableColumn = None,
+    true_column: TableColumn = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
 ) -> None:
     """Fit the curve of the sensor to a table of readings and true displacements, in µm."""
     found = api.calibrate_sensor(
         pairs, output, by=by, reference=reference, overwrite=overwrite,
-        reading_column=column_of(reading_column) or 1, true_column=column_of(true_column) or 2,
+        reading_column=column_of(reading_column), true_column=column_of(true_column),
     )  # fmt: skip
     _show_fit(found, output, as_json=as_json)
 
@@ -101,19 +101,20 @@ def _print_fit(found: CalibrationFit, output: Path) -> None:
     fitted = found.fitted
     unit, x = "µm", "reading"
     if isinstance(fitted, AmplifierCalibration):
-        unit, x, (low, high) = fitted.unit, "command", fitted.range
+        unit, x = fitted.unit, "command"
         curve = f"actual command = {fitted.gain:.6g} * command {fitted.offset:+.4g} {unit}"
     else:
-        low, high = fitted.range_um
         order = len(fitted.polynomial or ()) - 1
         curve = f"polynomial of order {order}" if fitted.polynomial else "table of the points"
     rows = zip(found.x.tolist(), found.true.tolist(), found.residuals.tolist(), strict=True)
     headings = (f"{x}, {unit}", f"true, {unit}", f"residual, {unit}")
     print_rich(table("", headings, [[f"{value:.5g}" for value in row] for row in rows]))
-    percent = 100.0 * fitted.residual_max / (high - low)
-    largest = f"at most {fitted.residual_max:.3g} {unit} ({percent:.2g} % of the range)"
-    print(f"{curve}, from {low:g} to {high:g} {unit}")
+    percent = f"{fitted.residual_percent:.2g} % of the range"
+    largest = f"at most {fitted.residual_max:.3g} {unit} ({percent}): {fitted.grade}"
+    print(f"{curve}, from {fitted.ends[0]:g} to {fitted.ends[1]:g} {unit}")
     print(f"residual {fitted.residual_rms:.3g} {unit} rms, {largest}")
+    if fitted.grade == "poor":
+        print("measure again: average more readings per point, and check the reference instrument")
     print(f"calibration: {output}; set device.calibration to it")
 
 

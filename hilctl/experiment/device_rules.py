@@ -65,16 +65,20 @@ def start_warnings(config: Experiment, info: DeviceInfo) -> tuple[str, ...]:
 
 
 def calibration_warnings(info: DeviceInfo, now_s: float) -> tuple[str, ...]:
-    """Return a warning for each calibration that is too old at a Unix time."""
+    """Return a warning for each calibration that is too old at a Unix time, or poor."""
     if info.calibration is None:
         return ()
     day = _EPOCH + now_s // 86400.0  # as date.toordinal, beyond its last year as well
-    return tuple(
-        f"device.calibration: the {part} was calibrated on {made}, more than a year ago. Calibrate "
-        f"it again with 'hilctl calibrate {part}'."
-        for part, made in info.calibration.content.dates.items()
-        if day - made.toordinal() > _YEAR_DAYS
-    )
+    found = []
+    for part, made in info.calibration.content.parts.items():
+        again = f"Calibrate it again with 'hilctl calibrate {part}'."
+        if day - made.date.toordinal() > _YEAR_DAYS:
+            text = f"the {part} was calibrated on {made.date}, more than a year ago"
+            found.append(f"device.calibration: {text}. {again}")
+        if made.grade == "poor":
+            text = f"the residual of the {part} is {made.residual_percent:.2g} % of its range"
+            found.append(f"device.calibration: {text}. {again}")
+    return tuple(found)
 
 
 def device_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:

@@ -21,7 +21,7 @@ def calibration(tmp_path_factory):
     share = true / rated.sensor_range_um
     noise = np.random.default_rng(1).normal(0.0, rated.sensor_noise_um, true.size)
     reading = true + 3.75 * 1.5 * 3**0.5 * (share - share**3) + noise
-    np.savetxt(folder / "pairs.csv", np.c_[reading, true], delimiter=",")
+    np.savetxt(folder / "pairs.csv", np.c_[reading, true], delimiter=",", header="reading,true")
     given = {"by": "N. N.", "reference": "the simulation"}
     api.calibrate_sensor(folder / "pairs.csv", folder / "sensor.yaml", **given)
     return folder / "sensor.yaml"

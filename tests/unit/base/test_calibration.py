@@ -46,6 +46,7 @@ def test_a_file_is_read_as_it_was_written(text):
     (TABLE + "  polynomial: [1.0, 1.0]\n", "sensor"),
     (AMPLIFIER.replace("1.02", "0.5"), "amplifier.gain"),
     (AMPLIFIER.replace("0.01", "2.1"), "amplifier"),
+    (AMPLIFIER.replace("[-1.0, 1.0]", "[0, 0]").replace("0.01", "0"), "amplifier"),
     ("{}", ""),
 ])  # fmt: skip
 def test_a_broken_rule_is_named_with_its_key(text, key):
@@ -66,3 +67,13 @@ def test_a_curve_ends_where_the_range_or_the_sensor_does(text, expected):
     np.testing.assert_allclose(np.interp(readings, *curve), expected)
     with pytest.raises(InputError, match="range_um"):
         loaded(text).sensor.curve(60.0, 100.0)
+
+
+@pytest.mark.parametrize(("largest", "sensor", "amplifier"), [
+    (0.0, "good", "good"), (0.01, "good", "good"), (0.03, "good", "usable"),
+    (0.05, "good", "poor"), (0.6, "usable", "poor"), (2.1, "poor", "poor"),
+])  # fmt: skip
+def test_the_largest_residual_is_graded_against_the_calibrated_range(largest, sensor, amplifier):
+    """The ranges are 100 um and 2 A."""
+    text = (CALIBRATION + AMPLIFIER).replace("residual_max: 0.2", f"residual_max: {largest}")
+    assert [each.grade for each in loaded(text).parts.values()] == [sensor, amplifier]

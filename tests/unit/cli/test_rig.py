@@ -172,8 +172,18 @@ def test_a_sensor_is_calibrated_once(hilctl, pairs, tmp_path):
     printed = json.loads(shown)
     assert code == 0
     assert printed["polynomial"] == pytest.approx([1.0, 2.0])
-    assert printed["output"] == str(output)
+    assert (printed["output"], printed["grade"]) == (str(output), "good")
     written = load_document(output).validate(CalibrationFile).sensor
     assert (written.by, written.reference, written.range_um) == (ORIGIN[1], ORIGIN[3], (0.0, 4.0))
     assert hilctl(*arguments)[0] == 2
     assert hilctl(*arguments, "--overwrite")[0] == 0
+
+
+def test_a_mistyped_point_writes_no_calibration(hilctl, pairs, tmp_path):
+    rows = (f"{i},{2 * i + 1 + 5 * (i == 4)}\n" for i in range(10))
+    pairs.write_text("reading,true\n" + "".join(rows))
+    output = tmp_path / "calibration.yaml"
+    code, _, problem = hilctl("calibrate", "sensor", pairs, "--output", output, *ORIGIN)
+    assert code == 2
+    assert "pairs.csv:6:" in problem
+    assert not output.exists()

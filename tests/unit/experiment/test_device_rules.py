@@ -2,7 +2,7 @@
 
 import math
 from dataclasses import replace
-from datetime import datetime
+from datetime import UTC, datetime
 from pathlib import Path
 from types import SimpleNamespace
 
@@ -263,6 +263,14 @@ def test_a_calibration_of_more_than_a_year_ago_is_told(tmp_path, now, warnings):
     now_s = datetime.fromisoformat(f"{now}T12:00+00:00").timestamp()
     assert len(calibration_warnings(info, now_s)) == warnings
     assert len(calibration_warnings(info, 1e12)) == 1  # as a campaign asks, after the year 9999
+
+
+def test_a_poor_calibration_is_told(tmp_path):
+    path = tmp_path / "calibration.yaml"
+    path.write_text(CALIBRATION.replace("residual_max: 0.2", "residual_max: 2.1"))
+    info = loaded(CURRENT, f"device.calibration={path}").device.info
+    (warning,) = calibration_warnings(info, datetime(2026, 2, 1, tzinfo=UTC).timestamp())
+    assert "2.1 %" in warning
 
 
 @pytest.mark.parametrize(("block", "problems"), [(58, 1), (580, 0)])
