@@ -100,6 +100,7 @@ def test_the_output_is_safe_although_the_command_that_takes_over_is_killed(
 
 
 @pytest.mark.long
+@pytest.mark.timeout(1800)
 @pytest.mark.parametrize("command", ["run", "safe", "probe", "recovery", "campaign"])
 def test_the_output_is_safe_after_fifty_kills(tmp_path, emulate, profile, run, command):
     taken = Taken(tmp_path, emulate, profile, run)
