@@ -61,8 +61,8 @@ class Taken:
 
     def returns(self):
         """Let the module return; return the time until its output is at the safe value."""
-        began_s = time.monotonic()
         self.module.come_back()
+        began_s = time.monotonic()
         while not any(abs(each) < 1e-5 for each in self.module.writes_a()):
             if time.monotonic() > began_s + 60.0:
                 return float("inf")
