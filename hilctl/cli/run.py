@@ -22,6 +22,7 @@ from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import adapted_text
 from hilctl.base.formatting import unit_text
+from hilctl.base.subprocesses import python_command
 from hilctl.cli.console import compile_progress, console, listing, progress_bar
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import Verbosity, print_json, print_result
@@ -127,7 +128,7 @@ def _report(result: RunResult, *, every: bool) -> tuple[RunReport | None, int]:
 @contextmanager
 def _watched() -> Iterator[None]:
     """Show the run from a subprocess, so that a blocked terminal cannot delay the run."""
-    with subprocess.Popen([sys.executable, "-Pm", "hilctl.cli.live", str(os.getpid())]) as process:
+    with subprocess.Popen(python_command("-m", "hilctl.cli.live", str(os.getpid()))) as process:
         try:
             yield
         finally:

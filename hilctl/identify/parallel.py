@@ -10,6 +10,7 @@ from multiprocessing import get_context
 from typing import Any, TypeAlias, TypeVar
 
 from hilctl.base.errors import InputError
+from hilctl.base.subprocesses import safe_import_path
 
 Task = TypeVar("Task")
 Result = TypeVar("Result")
@@ -58,7 +59,8 @@ def workers(scheduler: str = "none") -> Iterator[MapFunction]:
     if scheduler == "none":
         yield map  # serial
     elif scheduler == "processes":  # spawned: a fork would copy BLAS's threads
-        with ProcessPoolExecutor(mp_context=get_context("spawn")) as processes:
+        spawn = get_context("spawn")
+        with safe_import_path(), ProcessPoolExecutor(mp_context=spawn) as processes:
             yield processes.map
     elif scheduler == "threads":
         unwanted = threading.Event()

@@ -15,7 +15,6 @@ import logging
 import re
 import secrets
 import socket
-import sys
 import tempfile
 import time
 from asyncio.subprocess import DEVNULL, PIPE
@@ -39,6 +38,7 @@ from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl.base.formatting import finite_json, printable
 from hilctl.base.strict import StrictModel, first_problem
+from hilctl.base.subprocesses import python_command
 from hilctl.live.run_reader import RunList, RunReader, ScopeMode, frame_of, nearest_window_s
 from hilctl.run.control.client import ask, request_stop
 from hilctl.run.run_folder import RunFolder
@@ -337,7 +337,7 @@ class LiveServer:
             page = Path(folder) / "report.html"
             words = ["report", str(recording), "--html", str(page)]
             made = await asyncio.create_subprocess_exec(
-                *(sys.executable, "-m", "hilctl", *words), stdout=DEVNULL, stderr=PIPE
+                *python_command("-m", "hilctl", *words), stdout=DEVNULL, stderr=PIPE
             )
             _, error = await made.communicate()
             if made.returncode:

@@ -15,6 +15,7 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
 from hilctl.base.errors import RunError
+from hilctl.base.subprocesses import python_command
 from hilctl.live.foxglove import PORT, FoxgloveServer
 from hilctl.live.run_reader import RunList
 from hilctl.live.server import LiveServer
@@ -77,8 +78,7 @@ def served_beside() -> Iterator[str]:
     Raise RunError if the server cannot be started.
     """
     process = subprocess.Popen(
-        # -P: never import from the working folder.
-        [sys.executable, "-P", "-m", "hilctl.live.server_process"],
+        python_command("-m", "hilctl.live.server_process"),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         start_new_session=True,  # a Ctrl-C in the terminal is the supervisor's to handle

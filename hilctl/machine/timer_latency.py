@@ -20,6 +20,7 @@ import numpy as np
 
 from hilctl.base.device import Clock
 from hilctl.base.errors import InputError, RunError
+from hilctl.base.subprocesses import python_command
 from hilctl.base.types import I64
 from hilctl.loop.pacer import LatePolicy, LateRules, Pacer, SystemClock
 from hilctl.machine.rt_setup import Realtime, SetUpStep, prepare
@@ -101,7 +102,7 @@ def measure(
 def _ask(job: str, seconds: float, on_progress: Callable[[float], None]) -> str:
     started = time.monotonic()
     with subprocess.Popen(
-        [sys.executable, "-P", "-m", "hilctl.machine.timer_latency"],
+        python_command("-m", "hilctl.machine.timer_latency"),
         stdin=subprocess.PIPE,
         stdout=subprocess.PIPE,
         text=True,

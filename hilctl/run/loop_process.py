@@ -17,6 +17,7 @@ from hilctl.base.device import Clock
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.segments import Segment
+from hilctl.base.subprocesses import python_command
 from hilctl.experiment.conditioning import conditioning_of
 from hilctl.experiment.load import LoadedExperiment, resolve
 from hilctl.loop.adaptation import DisplacementOperator
@@ -233,7 +234,7 @@ def _become_guardian(path: str, job: Job, page: SharedPage) -> None:
         if page.get(PageField.GUARDIAN_HEARTBEAT_NS) != heartbeat_ns:
             return  # it acts as soon as this process has ended
     os.dup2(1, 2)  # otherwise a reader of the supervisor's errors waits for this process
-    words = [sys.executable, "-P", "-m", GUARDIAN, path, "act"]
+    words = python_command("-m", GUARDIAN, path, "act")
     os.execv(words[0], words)  # noqa: S606  with the locks, and without a gap
 
 

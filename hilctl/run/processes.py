@@ -5,13 +5,13 @@ import os
 import select
 import signal
 import subprocess
-import sys
 import time
 from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from typing import Any, Literal
 
 from hilctl.base.errors import InputError, RunError
+from hilctl.base.subprocesses import python_command
 from hilctl.run.run_folder import GUARDIAN, LOOP, DeviceLocks, RunFolder, locked_run, runs
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase, SharedPage
@@ -31,7 +31,7 @@ def start_process(
 ) -> "subprocess.Popen[bytes]":
     """Start a module as a process of the run, which keeps the inherited descriptors open."""
     return subprocess.Popen(
-        [sys.executable, "-P", "-m", module, *words],  # -P: import nothing from the working folder
+        python_command("-m", module, *words),
         stdin=subprocess.DEVNULL,
         stdout=subprocess.DEVNULL,  # otherwise a reader of the supervisor's waits for this process
         stderr=stderr,

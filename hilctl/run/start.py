@@ -23,6 +23,7 @@ from typing import Any, BinaryIO, Self, TypeAlias
 
 from hilctl.base.errors import DataError, HilctlError, InputError, RunError
 from hilctl.base.files import check_no_input, make_folder
+from hilctl.base.subprocesses import python_command
 from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.load import LoadedExperiment, input_files, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, check
@@ -211,8 +212,7 @@ def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) ->
     with os.fdopen(read_end, "rb") as answers:
         try:
             process = subprocess.Popen(
-                # -P: import nothing from the working folder.
-                [sys.executable, "-P", "-c", _START, str(write_end)],
+                python_command("-c", _START, str(write_end)),
                 stdin=subprocess.PIPE,
                 pass_fds=(write_end,),
                 start_new_session=True,  # Ctrl-C is forwarded once
@@ -319,7 +319,7 @@ def start_detached(
     checked = checked_experiment(experiment, settings)
     output = output_of(checked, output)
     log = unused(output.with_suffix(".log"), ".")
-    command = [sys.executable, "-P", "-m", "hilctl", "run", str(experiment), *flags]
+    command = python_command("-m", "hilctl", "run", str(experiment), *flags)
     command += ["--output", str(output)]
     command += [word for setting in settings for word in ("--set", setting)]
     try:

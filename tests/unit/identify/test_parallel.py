@@ -1,6 +1,7 @@
 """Work shared out over processes or a cluster finds the same."""
 
 import importlib.util
+import math
 import os
 import threading
 
@@ -89,6 +90,15 @@ def test_dask_cluster_finds_the_same(loops):
     ):  # fmt: skip
         found = fit_model(FitRequest(loops[:4], settings, run=run))
     assert found.model == alone.model
+
+
+def test_processes_execute_nothing_of_the_working_folder(tmp_path, monkeypatch):
+    """Their first imports precede the list of folders that they get."""
+    (tmp_path / "socket.py").write_text("raise SystemExit(7)", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
+    monkeypatch.delenv("PYTHONSAFEPATH", raising=False)
+    with workers("processes") as run:
+        assert list(run(math.sqrt, [4.0])) == [2.0]
 
 
 def test_unknown_schedulers_are_refused():

@@ -142,7 +142,10 @@ def test_requests_go_to_the_control_socket(description, tmp_path, monkeypatch):
 
 
 @pytest.mark.slow
-def test_report_is_served_to_the_page_that_asked_for_it(description, tmp_path):
+def test_report_is_served_to_the_page_that_asked_for_it(description, tmp_path, monkeypatch):
+    """It executes nothing of the working folder."""
+    (tmp_path / "hilctl.py").write_text("raise SystemExit(7)", encoding="utf-8")
+    monkeypatch.chdir(tmp_path)
     recording = tmp_path / "a.mcap"
     shutil.copy(CONFIGS.parent / "recordings" / "golden" / "terfenol_compensated.mcap", recording)
 
