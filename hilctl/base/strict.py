@@ -1,5 +1,6 @@
 """Base of all pydantic models, the pydantic names that models use, and the words of its errors."""
 
+import re
 from collections.abc import Iterable, Mapping
 from typing import ClassVar, Self
 
@@ -19,9 +20,9 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 __all__ = [
-    "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "StrictModel",
+    "HALF_CHARACTER", "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "StrictModel",
     "StringConstraints", "ValidationError", "ValidationInfo", "WithJsonSchema", "field_validator",
-    "first_problem", "model_validator",
+    "first_problem", "model_validator", "without_halves",
 ]  # fmt: skip
 
 
@@ -67,6 +68,21 @@ def expected(detail: ErrorDetails) -> str:
     """Return the words that a value must be one of."""
     context = detail.get("ctx", {})
     return str(context.get("expected") or context.get("expected_tags"))
+
+
+HALF_CHARACTER = "holds half a character (an escape from \\ud800 to \\udfff)"
+"""Rule that a text breaks which no file can hold."""
+_ESCAPES = re.compile(
+    r"\\u[dD][89abAB]\w\w\\u[dD][c-fC-F]\w\w|(\\u[dD][89a-fA-F]\w\w)|\\.", re.DOTALL
+)
+
+
+def without_halves(json_text: str) -> str:
+    """Return a JSON text with U+FFFD for each escape of half a character.
+
+    Browsers cut a text at its length in halves of characters, and JSON is read without them only.
+    """
+    return _ESCAPES.sub(lambda escape: "\\ufffd" if escape[1] else escape[0], json_text)
 
 
 def first_problem(error: ValidationError, whole: str = "message") -> str:

@@ -32,7 +32,7 @@ from yaml.composer import ComposerError
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
-from hilctl.base.strict import WORDS, expected, rule_of
+from hilctl.base.strict import HALF_CHARACTER, WORDS, expected, rule_of
 
 Loc: TypeAlias = tuple[str | int, ...]
 """Location of a value: keys and list indices."""
@@ -293,7 +293,7 @@ class _PlainLoader(yaml.SafeLoader):
         if self._depth > MAX_DEPTH:
             return f"nested more than {MAX_DEPTH} deep"
         if isinstance(event, yaml.ScalarEvent) and re.search("[\ud800-\udfff]", event.value):
-            return "holds half a character (an escape from \\ud800 to \\udfff)"
+            return HALF_CHARACTER
         return ""
 
 

@@ -37,7 +37,7 @@ from websockets.typing import Subprotocol
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl.base.formatting import finite_json, printable
-from hilctl.base.strict import StrictModel, first_problem
+from hilctl.base.strict import HALF_CHARACTER, StrictModel, first_problem, without_halves
 from hilctl.base.subprocesses import python_command
 from hilctl.live.run_reader import RunList, RunReader, ScopeMode, frame_of, nearest_window_s
 from hilctl.run.control.client import ask, request_stop
@@ -45,6 +45,8 @@ from hilctl.run.run_folder import RunFolder
 
 MAX_MESSAGE_BYTES = 4096
 """Largest message of a page."""
+_IMMEDIATE = {"view", "stop"}
+_MOST_WAITING = 16
 SLOW_S = 5.0
 """A page that reads nothing for this time is disconnected."""
 
@@ -115,21 +117,43 @@ class PageSession:
             return
 
     async def serve(self) -> None:
-        """Execute the requests of the page until it disconnects."""
-        async for raw in self._connection:
-            try:
-                message = PageMessage.model_validate_json(raw)
-            except ValidationError:
-                await self._connection.close(1008, "invalid message")
-                return
-            if message.ask == "view":
+        """Execute the requests of the page until it disconnects; a stop waits for no other one."""
+        waiting: asyncio.Queue[PageMessage] = asyncio.Queue(_MOST_WAITING)
+        async with asyncio.TaskGroup() as group:
+            executing = group.create_task(self._execute(waiting))
+            async for raw in self._connection:
+                text = raw if isinstance(raw, str) else ""
                 try:
-                    self.view = PageView.model_validate(message.view)
-                except ValidationError as error:
-                    text = first_problem(error)
-                    await self._connection.send(answer_text(message, ok=False, error=text))
-                    continue
-            await self._connection.send(await self._answer(self, message))
+                    message = PageMessage.model_validate_json(without_halves(text))
+                except ValidationError:
+                    await self._connection.close(1008, "invalid message")
+                    break
+                if problem := self._taken(message, waiting, whole=without_halves(text) == text):
+                    await self._send((answer_text(message, ok=False, error=problem),))
+                elif message.ask in _IMMEDIATE:
+                    await self._send((await self._answer(self, message),))
+            executing.cancel()
+
+    def _taken(
+        self, message: PageMessage, waiting: asyncio.Queue[PageMessage], *, whole: bool
+    ) -> str:
+        """Take a message; return why it is refused, or an empty text."""
+        if not whole:
+            return f"a text {HALF_CHARACTER}"
+        try:
+            if message.ask == "view":
+                self.view = PageView.model_validate(message.view)
+            if message.ask not in _IMMEDIATE:
+                waiting.put_nowait(message)
+        except ValidationError as error:
+            return first_problem(error)
+        except asyncio.QueueFull:
+            return f"{_MOST_WAITING} requests of this page are waiting already: try again"
+        return ""
+
+    async def _execute(self, waiting: asyncio.Queue[PageMessage]) -> None:
+        while True:
+            await self._send((await self._answer(self, await waiting.get()),))
 
 
 PROTOCOL = Subprotocol("hilctl.live.1")

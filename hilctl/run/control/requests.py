@@ -26,7 +26,7 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import MARK, Event
 from hilctl.base.private_dirs import private_folder
-from hilctl.base.strict import StrictModel, first_problem
+from hilctl.base.strict import HALF_CHARACTER, StrictModel, first_problem, without_halves
 from hilctl.experiment.forecast import fade_refusal
 from hilctl.experiment.preflight import CheckedExperiment, command_problems, reference_problems
 from hilctl.loop.compensator import Compensator
@@ -407,6 +407,9 @@ class Requests:
 
     def answer(self, line: bytes) -> Mapping[str, Any]:
         """Answer one line of JSON, from any thread; a change waits for the previous one."""
+        text = line.decode("latin-1")  # an escape is ASCII
+        if without_halves(text) != text:
+            raise InputError(f"message: {HALF_CHARACTER}")
         try:
             request = REQUESTS.validate_json(line)
         except ValidationError as error:

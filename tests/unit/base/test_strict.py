@@ -3,7 +3,7 @@
 import pytest
 from pydantic import ValidationError
 
-from hilctl.base.strict import StrictModel
+from hilctl.base.strict import StrictModel, without_halves
 
 
 class Gain(StrictModel):
@@ -28,3 +28,15 @@ def test_what_is_not_exactly_right_is_refused(given):
 def test_models_do_not_change():
     with pytest.raises(ValidationError, match="frozen"):
         Gain(gain=1.0).gain = 2.0
+
+
+@pytest.mark.parametrize(("text", "whole"), [
+    (r'"\ud83d\ude00"', r'"\ud83d\ude00"'),
+    (r'"\\ud83d"', r'"\\ud83d"'),  # a backslash, and no escape
+    (r'"\\\ud83d"', r'"\\\ufffd"'),
+    (r'"\uD83D\ud83d\uDE00"', r'"\ufffd\ud83d\uDE00"'),
+    (r'"\udE00 \ud83d"', r'"\ufffd \ufffd"'),
+    (r'"\ud8"', r'"\ud8"'),
+])  # fmt: skip
+def test_halves_of_characters_are_replaced(text, whole):
+    assert without_halves(text) == whole

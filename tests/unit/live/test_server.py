@@ -396,6 +396,56 @@ def test_invalid_message_ends_the_connection():
         assert (connection.closed[0], connection.sent) == (1008, [])
 
 
+@pytest.mark.parametrize("half", [r"\ud83d", r"\uDE00", r"\ud83dx", r"\ud83d\u0041"])
+def test_half_a_character_is_refused_without_effect(half):
+    """A browser cuts a mark at its greatest length in the middle of a character."""
+    mark = f'{{"id": 5, "ask": "run", "request": {{"command": "mark", "text": "{half}"}}}}'
+    _, connection = served(mark, message(id=6, ask="stop"))
+    assert connection.closed is None
+    refused = json.loads(connection.sent[0])
+    assert (refused["id"], refused["ok"]) == (5, False)
+    assert "half a character" in refused["error"]
+    assert connection.sent[1] == "6 stop"
+
+
+def test_stop_waits_for_no_other_request():
+    """A change waits for the one before it, and a report for its process."""
+
+    async def exchanged():
+        done = asyncio.Event()
+        messages = asyncio.Queue()
+
+        async def slow_answer(viewer, message):
+            if message.ask != "stop":
+                await done.wait()
+            return f"{message.id} {message.ask}"
+
+        class Open(Connection):
+            async def __aiter__(self):
+                while True:
+                    yield await messages.get()
+
+        connection = Open()
+        serving = asyncio.create_task(PageSession(connection, slow_answer).serve())
+        for number in range(30):
+            messages.put_nowait(message(id=number, ask="run"))
+        messages.put_nowait(message(id=99, ask="stop"))
+        while "99 stop" not in connection.sent:
+            await asyncio.sleep(0)
+        early = list(connection.sent)
+        done.set()
+        while "15 run" not in connection.sent:
+            await asyncio.sleep(0)
+        serving.cancel()
+        return early, connection.sent[len(early) :]
+
+    early, later = asyncio.run(asyncio.wait_for(exchanged(), 20.0))
+    assert early[-1] == "99 stop"
+    assert [json.loads(each)["ok"] for each in early[:-1]] == [False] * len(early[:-1])
+    assert len(early) > 5  # the number of waiting requests is limited
+    assert later == [f"{number} run" for number in range(len(later))]
+
+
 BAD_TIMES = ("0", "-0.0", "-1", "1e-320", "1e308", "NaN", "Infinity", "1e999", "true", '"2"', "[]")
 
 

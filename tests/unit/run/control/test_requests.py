@@ -112,6 +112,7 @@ def test_nobody_stops_a_run_by_its_socket(requests):
     (b"[" * 4000, "message: "),
     (b'{"command": ' + b'{"command": ' * 300, "message: "),
     (b"null", "message: "),
+    (rb'{"command": "mark", "text": "\ud83d"}', "half a character"),
     (b"\xff\xfe", "message: "),
     (b'{"command": "status", "more": 1}', "more: "),
 ])  # fmt: skip
