@@ -237,6 +237,8 @@ _STATUS_FRAMES = 6  # values that change more often are unreadable
 _MOST_VIEWERS = 16
 _LIVE = "/live"
 _REQUEST_S = 30.0
+_REPORT_S = 300.0
+_MOST_REPORTS = 4
 
 
 @cache
@@ -275,7 +277,8 @@ class LiveServer:
         self._pending: dict[ServerConnection, Callable[[], None]] = {}  # not authenticated yet
         self._viewers: set[PageSession] = set()
         self._feeds = RunList(chosen)
-        self._reports: dict[str, bytes] = {}
+        self._reports: dict[str, bytes] = {}  # the newest ones
+        self._reporting = asyncio.Lock()
 
     @property
     def url(self) -> str:
@@ -355,19 +358,20 @@ class LiveServer:
         """Return the path of the report of a recording, which only this page knows.
 
         Raises:
-            InputError: There is no report of it.
+            InputError: There is no report of it, or another one is being made.
         """
-        with tempfile.TemporaryDirectory(prefix="hilctl-") as folder:
-            page = Path(folder) / "report.html"
-            words = ["report", str(recording), "--html", str(page)]
-            made = await asyncio.create_subprocess_exec(
-                *python_command("-m", "hilctl", *words), stdout=DEVNULL, stderr=PIPE
-            )
-            _, error = await made.communicate()
-            if made.returncode:
-                raise InputError(printable(error.decode(errors="replace").strip()))
-            path = f"/report/{secrets.token_hex(16)}"
-            self._reports[path] = page.read_bytes()
+        if self._reporting.locked():
+            raise InputError("another report is being made: try again when it is finished")
+        async with self._reporting:
+            with tempfile.TemporaryDirectory(prefix="hilctl-") as folder:
+                page = Path(folder) / "report.html"
+                await _made(
+                    python_command("-m", "hilctl", "report", str(recording), "--html", str(page))
+                )
+                path = f"/report/{secrets.token_hex(16)}"
+                self._reports[path] = page.read_bytes()
+        while len(self._reports) > _MOST_REPORTS:
+            del self._reports[next(iter(self._reports))]
         return path
 
     async def _tick(self, over: Callable[[RunList], bool]) -> None:
@@ -412,6 +416,26 @@ class LiveServer:
                 "signals": [[each.name, each.label, each.unit] for each in feed.signals],
             }
         return finite_json(state)
+
+
+async def _made(command: list[str]) -> None:
+    """Wait for a command that makes a report; raise InputError if it fails or takes too long."""
+    made = await asyncio.create_subprocess_exec(
+        *command, stdin=DEVNULL, stdout=DEVNULL, stderr=PIPE
+    )
+    try:
+        async with asyncio.timeout(_REPORT_S):
+            _, error = await made.communicate()
+    except TimeoutError:
+        raise InputError(
+            f"not finished within {_REPORT_S:g} s: use hilctl report --html in a terminal"
+        ) from None
+    finally:
+        if made.returncode is None:  # too slow, or the page was closed
+            made.kill()
+            await made.wait()
+    if made.returncode:
+        raise InputError(printable(error.decode(errors="replace").strip()))
 
 
 def listeners(port: int) -> list[socket.socket]:

@@ -446,6 +446,78 @@ def test_stop_waits_for_no_other_request():
     assert later == [f"{number} run" for number in range(len(later))]
 
 
+@pytest.fixture
+def reports(monkeypatch):
+    """Commands in place of the one that makes a report, and the processes of them."""
+    commands, made = [], []
+    start = asyncio.create_subprocess_exec
+
+    async def started(*command, **options):
+        made.append((command, await start(*commands.pop(0)(command), **options)))
+        return made[-1][1]
+
+    monkeypatch.setattr(asyncio, "create_subprocess_exec", started)
+    return commands, made
+
+
+def written(command):
+    return ["sh", "-c", f"echo {len(command)} > '{command[-1]}'"]
+
+
+def slow(command):
+    return ["sleep", "60"]
+
+
+def test_report_has_a_time_limit(reports, monkeypatch):
+    commands, made = reports
+    commands += [slow, written]
+    monkeypatch.setattr(module, "_REPORT_S", 0.05)
+
+    async def asked():
+        async with serving() as server:
+            with pytest.raises(InputError, match="hilctl report"):
+                await server._report(Path("a.mcap"))
+            assert made[0][1].returncode is not None
+            monkeypatch.setattr(module, "_REPORT_S", 20.0)
+            assert await server._report(Path("a.mcap")) in server._reports
+
+    asyncio.run(asked())
+
+
+def test_one_report_is_made_at_a_time(reports):
+    commands, made = reports
+    commands += [slow, written]
+
+    async def asked():
+        async with serving() as server:
+            going = asyncio.create_task(server._report(Path("a.mcap")))
+            while not made:
+                await asyncio.sleep(0.01)
+            with pytest.raises(InputError, match="another report"):
+                await server._report(Path("b.mcap"))
+            going.cancel()  # as when its page is closed
+            with suppress(asyncio.CancelledError):
+                await going
+            assert made[0][1].returncode is not None
+            return await server._report(Path("b.mcap"))
+
+    assert asyncio.run(asked()).startswith("/report/")
+
+
+def test_the_newest_reports_are_kept(reports):
+    commands, _ = reports
+    commands += [written] * 9
+
+    async def asked():
+        async with serving() as server:
+            paths = [await server._report(Path("a.mcap")) for _ in range(9)]
+            return paths, list(server._reports)
+
+    paths, kept = asyncio.run(asked())
+    assert 0 < len(kept) < 9
+    assert kept == paths[-len(kept) :]
+
+
 BAD_TIMES = ("0", "-0.0", "-1", "1e-320", "1e308", "NaN", "Infinity", "1e999", "true", '"2"', "[]")
 
 
