@@ -24,7 +24,6 @@ base         arrays, errors, the device contract, samples, strict YAML
 Devices are in ``hilctl_drivers``, which imports ``base`` and ``kernels`` only.
 """
 
-import os
 import sys
 import time
 
@@ -32,7 +31,8 @@ __version__ = "0.2.0"
 
 # The matrices here are small: more BLAS threads make a fit many times slower on a busy machine, and
 # the loop's process must not have any. It takes effect where numpy is not imported yet.
-os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
+OWN_ENVIRONMENT = {"OPENBLAS_NUM_THREADS": "1"}
+"""Environment variables of hilctl's own processes, unless they are set."""
 
 try:
     time.time()

@@ -14,6 +14,8 @@ from pathlib import Path
 import pytest
 from hypothesis import settings
 
+os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")  # before NumPy is imported, as in the command
+
 from hilctl.base import yaml
 from hilctl.base.private_dirs import memory_folder
 from hilctl.experiment import devices as registry

@@ -6,10 +6,12 @@ device with implausible answers, or a rig that cannot be characterised; 128 + n 
 signal n.
 """
 
+import os
 import signal
 import sys
 from typing import NoReturn
 
+from hilctl import OWN_ENVIRONMENT
 from hilctl.base.errors import ConfigError, HilctlError, RunError
 from hilctl.base.files import reason
 from hilctl.cli.output import (
@@ -33,6 +35,8 @@ LINUX_MODULES = {"fcntl", "grp", "pty", "pwd", "resource", "termios", "tty"}
 
 def main() -> None:
     """Run the command line and turn every expected error into a message and an exit code."""
+    for name, value in OWN_ENVIRONMENT.items():
+        os.environ.setdefault(name, value)
     take_verbosity(sys.argv)
     acts = any(name in ACTING for name in sys.argv[1:2])
     with safe_streams(acts=acts), output_as_requested(as_json="--json" in sys.argv):

@@ -8,8 +8,10 @@ import os
 from collections.abc import Callable
 from contextlib import suppress
 from functools import cache, partial, update_wrapper
+from pathlib import Path
 from typing import Annotated, Any, TypeVar, cast, get_args, get_origin, get_type_hints
 
+from hilctl.base.private_dirs import private_folder, user_folders
 from hilctl.base.types import F64, I64, U32
 
 DISABLED = os.environ.get("NUMBA_DISABLE_JIT", "0") not in {"", "0"}
@@ -24,7 +26,19 @@ def _numba() -> Any:
     from numba.extending import typeof_impl
 
     typeof_impl.register(_Kernel)(lambda kernel, _: numba.typeof(kernel.dispatcher))
+    config: Any = numba.config
+    config.CACHE_DIR = config.CACHE_DIR or _cache_folder()
     return numba
+
+
+def _cache_folder() -> str:
+    """Return a folder in memory if neither the package's nor the user's cache is writable."""
+    user_cache = os.environ.get("XDG_CACHE_HOME") or os.path.expanduser("~/.cache")  # noqa: PTH111
+    if not any(os.access(each, os.W_OK) for each in (Path(__file__).parent, user_cache)):
+        for folder in user_folders():
+            with suppress(OSError):
+                return str(private_folder(private_folder(folder) / "kernels"))
+    return ""
 
 
 class _Kernel:

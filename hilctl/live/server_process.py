@@ -14,6 +14,7 @@ import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager, suppress
 
+from hilctl import OWN_ENVIRONMENT
 from hilctl.base.errors import RunError
 from hilctl.base.subprocesses import python_command
 from hilctl.live.foxglove import PORT, FoxgloveServer
@@ -80,6 +81,7 @@ def served_beside() -> Iterator[str]:
     process = subprocess.Popen(
         python_command("-m", "hilctl.live.server_process"),
         stdin=subprocess.PIPE,
+        env=OWN_ENVIRONMENT | os.environ,
         stdout=subprocess.PIPE,
         start_new_session=True,  # a Ctrl-C in the terminal is the supervisor's to handle
         text=True,

@@ -18,6 +18,7 @@ from typing import Any
 
 import numpy as np
 
+from hilctl import OWN_ENVIRONMENT
 from hilctl.base.device import Clock
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.subprocesses import python_command
@@ -104,6 +105,7 @@ def _ask(job: str, seconds: float, on_progress: Callable[[float], None]) -> str:
     with subprocess.Popen(
         python_command("-m", "hilctl.machine.timer_latency"),
         stdin=subprocess.PIPE,
+        env=OWN_ENVIRONMENT | os.environ,
         stdout=subprocess.PIPE,
         text=True,
         start_new_session=True,  # the parent handles Ctrl-C

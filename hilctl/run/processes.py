@@ -10,6 +10,7 @@ from collections.abc import Callable, Sequence
 from contextlib import ExitStack, suppress
 from typing import Any, Literal
 
+from hilctl import OWN_ENVIRONMENT
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.subprocesses import python_command
 from hilctl.run.run_folder import GUARDIAN, LOOP, DeviceLocks, RunFolder, locked_run, runs
@@ -36,6 +37,7 @@ def start_process(
         stdout=subprocess.DEVNULL,  # otherwise a reader of the supervisor's waits for this process
         stderr=stderr,
         start_new_session=True,  # the supervisor handles Ctrl-C in the terminal
+        env=OWN_ENVIRONMENT | os.environ,
         pass_fds=inherits,
     )
 

@@ -21,6 +21,7 @@ from pathlib import Path
 from types import FrameType
 from typing import Any, BinaryIO, Self, TypeAlias
 
+from hilctl import OWN_ENVIRONMENT
 from hilctl.base.errors import DataError, HilctlError, InputError, RunError
 from hilctl.base.files import check_no_input, make_folder
 from hilctl.base.subprocesses import python_command
@@ -214,6 +215,7 @@ def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) ->
             process = subprocess.Popen(
                 python_command("-c", _START, str(write_end)),
                 stdin=subprocess.PIPE,
+                env=OWN_ENVIRONMENT | os.environ,
                 pass_fds=(write_end,),
                 start_new_session=True,  # Ctrl-C is forwarded once
             )

@@ -1,5 +1,8 @@
 """Write, load, check and run experiments from Python."""
 
+import os
+import subprocess
+import sys
 from pathlib import Path
 
 import pytest
@@ -80,3 +83,22 @@ def test_init_refuses_invalid_settings_and_existing_files(tmp_path):
     with pytest.raises(InputError, match="exists"):
         api.init("simulated_piezo", tmp_path / "a.yaml")
     assert (tmp_path / "a.yaml").read_text() == "mine"
+
+
+PROGRAM = f"""
+import os
+before = dict(os.environ)
+access, os.access = os.access, lambda *_: False  # no folder for kernels
+from hilctl import api
+api.load({str(SINE)!r})
+api.read, api.identify
+from hilctl.kernels import jit
+jit._numba()
+assert os.environ == before, set(os.environ.items()) ^ set(before.items())
+"""
+
+
+def test_a_program_keeps_its_environment():
+    kept = {k: v for k, v in os.environ.items() if not k.startswith(("OPENBLAS", "NUMBA"))}
+    ended = subprocess.run([sys.executable, "-c", PROGRAM], env=kept, capture_output=True)
+    assert ended.returncode == 0, ended.stderr.decode()

@@ -16,6 +16,7 @@ from hilctl.cli.commands import COMMANDS, app, load
 
 RECORDING = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 MAIN = "from hilctl.cli import main; main()"
+THREADS = "OPENBLAS_NUM_THREADS"
 
 
 def in_a_process(code, *arguments, **environment):
@@ -37,6 +38,13 @@ def test_a_clock_that_python_cannot_read_is_one_message():
     ended = in_a_process(code, "list")
     assert (ended.returncode, ended.stdout, ended.stderr.count("\n")) == (2, "", 1)
     assert ended.stderr.startswith("hilctl: ")
+
+
+@pytest.mark.parametrize(("own", "expected"), [("", "1"), ("3", "3")])
+def test_a_command_has_one_blas_thread_unless_set(own, expected):
+    code = f"from hilctl import cli\nimport os\nif not {own!r}: os.environ.pop({THREADS!r})\n"
+    code += f"cli._run_app = lambda: print(os.environ[{THREADS!r}])\ncli.main()"
+    assert in_a_process(code, "list", **{THREADS: own}).stdout.split() == [expected]
 
 
 def test_similar_command_is_suggested():

@@ -8,7 +8,6 @@ import numba
 import numpy as np
 import pytest
 
-from hilctl import kernels
 from hilctl.kernels import hysteresis, jit
 from hilctl.kernels.limit import limit_block
 
@@ -166,17 +165,14 @@ def test_kernels_are_cached_in_memory_if_no_other_folder_is_writable(
     tmp_path, monkeypatch, package, home, chosen
 ):
     monkeypatch.setenv("XDG_CACHE_HOME", "/home/cache")
-    monkeypatch.delenv("NUMBA_CACHE_DIR", raising=False)
-    if chosen:
-        monkeypatch.setenv("NUMBA_CACHE_DIR", chosen)
+    monkeypatch.setattr(numba.config, "CACHE_DIR", chosen)
     monkeypatch.setattr(os, "access", lambda path, _: home if path == "/home/cache" else package)
-    monkeypatch.setattr(
-        kernels, "user_folders", lambda: [tmp_path / "no" / "place", tmp_path / "own"]
-    )
-    kernels._set_cache_folder()
+    monkeypatch.setattr(jit, "user_folders", lambda: [tmp_path / "no" / "place", tmp_path / "own"])
+    jit._numba.cache_clear()
+    jit._numba()
     in_memory = not (package or home or chosen)
     expected = str(tmp_path / "own" / "kernels") if in_memory else chosen
-    assert os.environ.get("NUMBA_CACHE_DIR", "") == expected
+    assert expected == numba.config.CACHE_DIR
 
 
 def test_mistake_in_a_kernel_is_raised(cache):

@@ -233,3 +233,12 @@ def test_dead_guardians_are_started_again_with_the_lock_of_their_run(left, monke
     for each in locks:
         os.close(each)
     assert not dead.alive
+
+
+@pytest.mark.parametrize(("own", "expected"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
+def test_a_process_of_a_run_has_one_blas_thread_unless_set(monkeypatch, own, expected):
+    monkeypatch.setattr(module.os, "environ", {"HOME": "/home"} | own)
+    popen = Mock()
+    monkeypatch.setattr(module.subprocess, "Popen", popen)
+    module.start_process("some.module", inherits=())
+    assert popen.call_args.kwargs["env"] == {"HOME": "/home", "OPENBLAS_NUM_THREADS": expected}
