@@ -8,9 +8,12 @@ Encoding, separator, decimal mark, preamble, names and units of a text table are
 - The data begin with the first row that has a number in each numeric column. The row above it holds
   the names, or only units below the names. Otherwise names may be in a comment (``#`` or ``%``) of
   as many cells, as ``numpy.savetxt`` writes them. What is above is a preamble and is skipped.
+- The data end before a footer and a row that is not completely written, which are skipped with a
+  warning.
 """
 
 import csv
+import logging
 import re
 from abc import ABC, abstractmethod
 from array import array
@@ -27,7 +30,9 @@ import numpy.typing as npt
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import no_such_file, read_bytes
-from hilctl.base.types import F64
+from hilctl.base.types import F64, I64
+
+_log = logging.getLogger(__name__)
 
 Column: TypeAlias = str | int
 """A column by its name, or by its number from 1."""
@@ -60,6 +65,20 @@ def known_unit(text: str) -> tuple[str, float] | None:
     return _UNITS.get(bare) or _IN_ANY_CASE.get(bare.lower())
 
 
+class RowError(DataError):
+    """A row of a table is invalid."""
+
+    def __init__(self, text: str, row: int, count: int) -> None:
+        super().__init__(text)
+        self.row, self.count = row, count  # its number from 1, and the number of all rows
+
+    def without(self, prefix: str) -> DataError:
+        """Return the error with the setting that omits the row, and fewer than half of all."""
+        end = 2 * self.row > self.count
+        setting = f"last_row={self.row - 1}" if end else f"first_row={self.row + 1}"
+        return DataError(f"{self}: correct it, or omit it with {prefix}{setting}")
+
+
 @dataclass(frozen=True, slots=True)
 class TableRows:
     """Rows of a table.
@@ -74,11 +93,14 @@ class TableRows:
     values: F64
     lines: npt.NDArray[np.int64]
 
-    def sample_rate_hz(self, time: int, tolerance: float, factor: float = 1.0) -> float:
-        """Return the sample rate from column ``time``, in ``factor`` s.
+    def sample_grid(
+        self, time: int, tolerance: float, factor: float = 1.0, most_missing: float = 0.0
+    ) -> tuple[float, I64]:
+        """Return the sample rate from column ``time``, in ``factor`` s, and each row's sample.
 
-        No step may differ from the median by more than ``tolerance``, relative to it. Raise
-        DataError with the line if time does not rise, or not evenly.
+        No step may differ from the median, or a multiple where rows are missing, by more than
+        ``tolerance``, relative to the median. Raise DataError with the line if time does not rise,
+        or not evenly, or if more than a share ``most_missing`` of all rows is missing.
         """
         time_s: F64 = self.values[time] * factor
         steps = np.diff(time_s)
@@ -96,17 +118,22 @@ class TableRows:
         if not step > 0.0:
             rule = "time must rise from row to row"
             raise DataError(f"{self.path}: {rule}, by {step:g} s as a rule here")
-        wrong = np.abs(steps - step) > tolerance * step
+        counts = np.maximum(np.rint(steps / step), 1.0)
+        sample = np.concatenate(([0.0], np.cumsum(counts)))
+        wrong = np.abs(steps - counts * step) > tolerance * step
+        if sample[-1] - steps.size > most_missing * (sample[-1] + 1.0):
+            wrong |= counts > 1.0
         if not wrong.any():  # small errors of steps may add up
-            mean = span_s / steps.size
-            wrong = (np.abs(time_s - time_s[0] - mean * np.arange(time_s.size)) > _LATE * mean)[1:]
+            mean = span_s / sample[-1]
+            wrong = (np.abs(time_s - time_s[0] - mean * sample) > _LATE * mean)[1:]
         if wrong.any():
             row = int(np.argmax(wrong))
             raise DataError(
                 f"{self.path}:{self.lines[row + 1]}: samples must be evenly spaced in time: this "
-                f"one is {steps[row]:.6g} s after the one before, the median is {step:.6g} s"
+                f"one is {steps[row]:.6g} s after the one before, the median is {step:.6g} s. "
+                "Interpolate the table at an even time step"
             )
-        return steps.size / span_s
+        return float(sample[-1]) / span_s, sample.astype(np.int64)
 
 
 class Table(ABC):
@@ -174,8 +201,9 @@ class Table(ABC):
     ) -> TableRows:
         """Read some columns, by their indices from 0, of some rows, counted from 1; None for all.
 
-        Values of column ``gaps`` may be missing, that is NaN or an empty cell; they are NaN. Raise
-        DataError if rows are missing or, with the row, if another value is not a finite number.
+        Values of column ``gaps`` may be missing: empty, not finite, or the mark of an overload;
+        they are NaN. Raise DataError if there are no such rows, and RowError if another value is
+        not a finite number.
         """
 
 
@@ -200,17 +228,19 @@ class ArrayTable(Table):
         bad = np.argwhere(_invalid(values.T, columns, gaps))
         if bad.size:
             row, column = bad[0]
-            raise DataError(
+            raise RowError(
                 f"{self.path}: row {first_row + row}: {self.names[columns[column]]}: must be a "
-                f"finite number, got {values[column, row]}"
+                f"finite number, got {values[column, row]}",
+                first_row + int(row),
+                self._columns[0].size,
             )
+        values[~np.isfinite(values)] = np.nan
         return TableRows(self.path, values, first_row + np.arange(values.shape[1]))
 
 
 def _invalid(values: F64, columns: Sequence[int], gaps: int | None) -> npt.NDArray[np.bool_]:
     """Return which values of columns, float64[rows, columns], are neither finite nor missing."""
-    bad = ~np.isfinite(values)
-    bad &= ~np.isnan(values) | (np.array(columns) != gaps)
+    bad: npt.NDArray[np.bool_] = ~np.isfinite(values) & (np.array(columns) != gaps)
     return bad
 
 
@@ -231,6 +261,11 @@ MAX_TABLE_BYTES = 512 * 1024**2
 _COMMENT = "#%"
 _LONGEST_LINE = 100_000
 _SAMPLE = 20  # last lines that tell separator and decimal mark
+_LAST_DIGITS = re.compile(r"[.,]\d*$")
+_MISSING = re.compile(
+    r"|[+-]?(∞|o\.?l\.?|over(load|flow| ?range)?|1\.#\w+)|-{2,}|n/?a|null|none", re.IGNORECASE
+)
+"""Cells without a number, as instruments write them, above all if an input is overloaded."""
 _DECIMAL_COMMA = re.compile(r"[+-]?\d*,?\d+(e[+-]?\d+)?", re.IGNORECASE)
 
 
@@ -256,10 +291,17 @@ class TextTable(Table):
             raise DataError(f"{path}: must have at most {MAX_COLUMNS} columns, got {len(numeric)}")
         self._count = len(numeric)
         chosen = [column for column, is_numeric in enumerate(numeric) if is_numeric]
-        first = next(
-            at for at, (_, line) in enumerate(rows) if self._is_data(self.cells(line), chosen)
-        )
-        self._rows = rows[first:]
+        data = (at for at, (_, line) in enumerate(rows) if self._is_data(self.cells(line), chosen))
+        if (first := next(data, None)) is None:
+            raise DataError(f"{path}: holds no row with a number in each column of numbers")
+        last = len(rows) - (text[-1] not in "\r\n" and _is_cut(sample))
+        while last > first + 1 and self._is_footer(self.cells(rows[last - 1][1]), chosen):
+            last -= 1
+        if last < len(rows):
+            begin, line = rows[last]
+            rule = "incomplete row or footer, ignored from here to the end"
+            _log.warning("%s:%d: %s: %s", path, begin, rule, _short(line))
+        self._rows = rows[first:last]
         above = [cells for _, line in rows[:first][-2:] if (cells := self.cells(line))]
         names, units = self._titles(above, chosen)
         if not names:
@@ -277,8 +319,16 @@ class TextTable(Table):
         )
 
     def _is_data(self, cells: list[str], numeric: Sequence[int]) -> bool:
-        return len(cells) == self._count and all(
-            _value(cells[each], self._comma) is not None for each in numeric
+        chosen = [cells[each] for each in numeric] if len(cells) == self._count else []
+        numbers = [_value(cell, self._comma) is not None for cell in chosen]
+        return any(numbers) and all(
+            is_number or _MISSING.fullmatch(cell)
+            for is_number, cell in zip(numbers, chosen, strict=True)
+        )
+
+    def _is_footer(self, cells: list[str], numeric: Sequence[int]) -> bool:
+        return len(cells) < self._count or all(
+            _value(cells[each], self._comma) is None for each in numeric
         )
 
     def _titles(
@@ -304,11 +354,11 @@ class TextTable(Table):
     ) -> TableRows:
         """Read some columns of some rows, see :meth:`Table.read`; other cells may have any content.
 
-        Raise DataError, with the line, also if a row is longer or shorter than the others.
+        Raise RowError, with the line, also if a row is longer or shorter than the others.
         """
         check_rows(self.path, len(self._rows), first_row, last_row)
         rows = self._rows[first_row - 1 : last_row]
-        table = self._values(rows, columns, gaps)
+        table = self._values(rows, columns, gaps, first_row)
         lines = np.array([number for number, _ in rows])
         bad = np.argwhere(_invalid(table, columns, gaps))
         if bad.size:
@@ -316,24 +366,34 @@ class TextTable(Table):
             more = np.unique(bad[:, 0]).size - 1
             text = f"must be a finite number, got {table[row, column]}"
             text += f"; so in {more} more rows" if more else ""
-            raise DataError(f"{self._place(lines[row], columns[column])}: {text}")
+            place = self._place(lines[row], columns[column])
+            raise RowError(f"{place}: {text}", first_row + int(row), len(self._rows))
+        table[~np.isfinite(table)] = np.nan
         return TableRows(self.path, np.ascontiguousarray(table.T), lines)
 
-    def _values(self, rows: list[tuple[int, str]], columns: Sequence[int], gaps: int | None) -> F64:
-        """Return the values, float64[rows, columns]; raise DataError at the first invalid one."""
+    def _values(
+        self,
+        rows: list[tuple[int, str]],
+        columns: Sequence[int],
+        gaps: int | None,
+        first_row: int,
+    ) -> F64:
+        """Return the values, float64[rows, columns]; raise RowError at the first invalid one."""
         values = array("d")
-        for number, line in rows:
+        for row, (number, line) in enumerate(rows, start=first_row):
             cells = self.cells(line)
             if len(cells) != self._count:
                 rule = f"must have {self._count} columns, as the others have, got {len(cells)}"
-                raise DataError(f"{self.path}:{number}: {rule}: {_short(line)}")
+                text = f"{self.path}:{number}: {rule}: {_short(line)}"
+                raise RowError(text, row, len(self._rows))
             for column in columns:
                 value = _value(cells[column], self._comma)
-                if column == gaps and not cells[column]:
+                if value is None and column == gaps and _MISSING.fullmatch(cells[column]):
                     value = np.nan
                 if value is None:
                     text = f"must be a finite number, got {_short(cells[column])}"
-                    raise DataError(f"{self._place(number, column)}: {text}")
+                    text = f"{self._place(number, column)}: {text}"
+                    raise RowError(text, row, len(self._rows))
                 values.append(value)
         return np.array(values).reshape(-1, len(columns))
 
@@ -345,9 +405,10 @@ class TextTable(Table):
 
 def _decoded(path: Path, raw: bytes) -> str:
     if raw.startswith((b"\xff\xfe", b"\xfe\xff")):
-        encodings = ["utf-16"]
+        encodings, raw = ["utf-16"], raw[: len(raw) // 2 * 2]
     else:
-        encodings = ["utf-8-sig", "cp1252"]
+        # A power failure may leave zeros at the end of a file.
+        encodings, raw = ["utf-8-sig", "cp1252"], raw.rstrip(b"\0")
     for encoding in encodings:
         try:
             text = raw.decode(encoding)
@@ -380,6 +441,13 @@ def _form(sample: list[str]) -> tuple[str, bool, bool, list[bool]]:
             if (score, count) > best[0]:
                 best = ((score, count), separator, comma, trailing, numeric)
     return best[1:]
+
+
+def _is_cut(lines: list[str]) -> bool:
+    """Return whether the last line ends with fewer decimals than all others, which are equal."""
+    matches = (_LAST_DIGITS.search(line) for line in lines)
+    *others, last = (len(match[0]) if match else 0 for match in matches)
+    return len(lines) == _SAMPLE and len(set(others)) == 1 and last < others[0]
 
 
 def _split(line: str, separator: str) -> list[str]:

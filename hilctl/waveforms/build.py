@@ -12,7 +12,7 @@ import numpy.typing as npt
 from hilctl.base.errors import InputError
 from hilctl.base.files import no_such_file, reason
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
-from hilctl.base.table import ArrayTable, Table, open_table
+from hilctl.base.table import ArrayTable, RowError, Table, open_table
 from hilctl.base.types import CHUNK, F64, chunks
 from hilctl.waveforms import shapes, spec
 
@@ -87,7 +87,10 @@ def _read(w: spec.FileWaveform, path: Path) -> tuple[F64, float | None]:
         table, own_rate_hz = open_table(path), None
     at, time = table.index(w.column), table.only({"t_s"}, "s")
     base, factor = table.unit(at)
-    rows = table.read([at] if time is None else [at, time], w.first_row, w.last_row)
+    try:
+        rows = table.read([at] if time is None else [at, time], w.first_row, w.last_row)
+    except RowError as error:
+        raise error.without("") from None
     count = rows.lines.size
     if count < 2:
         raise InputError(f"{path}: needs at least two rows from first_row to last_row")
@@ -96,7 +99,7 @@ def _read(w: spec.FileWaveform, path: Path) -> tuple[F64, float | None]:
     except InputError as error:
         raise InputError(f"{path}: {error}") from None
     if time is not None:
-        own_rate_hz = rows.sample_rate_hz(1, _TIME_TOLERANCE, table.unit(time)[1])
+        own_rate_hz, _ = rows.sample_grid(1, _TIME_TOLERANCE, table.unit(time)[1])
     if path.suffix.lower() == ".mcap":  # its references may be in A or V
         factor = 1.0
     elif w.unit is not None and base not in {"", w.unit} and w.scale == 1.0:

@@ -11,7 +11,7 @@ import numpy as np
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.samples import Flag
-from hilctl.base.table import Column, Table, open_table
+from hilctl.base.table import Column, RowError, Table, open_table
 from hilctl.base.types import F64, I64, CommandUnit
 from hilctl.identify.data.cycles import find_cycles, loops_from_pieces
 from hilctl.identify.data.data_faults import correlation
@@ -39,7 +39,8 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
     """Read command and displacement from a table, see :func:`hilctl.base.table.open_table`.
 
     Raise DataError if a column is unknown or has the wrong unit, a value is not a finite number
-    (names ``file:line``), time steps are uneven, or settings are missing or contradict each other.
+    (names ``file:line``), time steps are uneven, more than 1 % of the rows are missing, or settings
+    are missing or contradict each other.
     """
     table = open_table(path, settings.skip_rows)
     command, output, *times = wanted = _columns(table, settings)
@@ -54,11 +55,19 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
     for time in times:
         per_s = _scale(table, time, "s", "--time-column", None)
         parts.insert(0, f"time {_called(table, time, 's')}")
-    found = table.read(wanted, settings.first_row, settings.last_row, gaps=output)
-    rate_hz = settings.rate_hz or found.sample_rate_hz(2, UNEVEN, per_s)
-    rows, missing = np.arange(found.lines.size), np.flatnonzero(np.isnan(found.values[1]))
-    signals = _filled(path, rows, found.values[0] * command_scale, found.values[1] * scale, rows)
-    history = History(path.name, *signals, rate_hz, settings.ignore, missing)
+    try:
+        found = table.read(wanted, settings.first_row, settings.last_row, gaps=output)
+    except RowError as error:
+        raise error.without("--set table.") from None
+    rate_hz, row = settings.rate_hz, np.arange(found.lines.size)
+    if rate_hz is None:
+        rate_hz, row = found.sample_grid(2, UNEVEN, per_s, MOST_MISSING)
+    every = np.arange(row[-1] + 1)
+    missing = np.setdiff1d(every, row[np.isfinite(found.values[1])])
+    _, displacement_um = _filled(path, row, found.values[0], found.values[1] * scale, every)
+    # Not held, as in skipped ticks: the device moved on when the logger lost a row.
+    command = np.interp(every, row, found.values[0] * command_scale)
+    history = History(path.name, command, displacement_um, rate_hz, settings.ignore, missing)
     if per_s == 1.0 and times:
         _check_rate(path, rate_hz)
     if scale == 1.0 and settings.displacement_scale is None:
@@ -263,7 +272,7 @@ def _filled(
         rule = f"{missing} of {wanted.size} samples are missing or have no displacement"
         raise DataError(f"{path}: {rule}: check late ticks and the sensor")
     if missing:
-        text = "the displacement is interpolated, and the command of skipped ticks is held"
+        text = "the displacement is interpolated, and not evaluated"
         _log.warning("%s: %d of %d samples are missing: %s", path, missing, wanted.size, text)
     last = np.maximum(np.searchsorted(index, wanted, side="right") - 1, 0)
     filled_um = np.interp(wanted, index[good], displacement_um[good])

@@ -6,7 +6,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.table import Table, TableRows, TextTable, open_table
+from hilctl.base.table import RowError, Table, TableRows, TextTable, open_table
 
 
 class Names(Table):
@@ -56,12 +56,24 @@ def test_column_that_nobody_named(tmp_path: Path) -> None:
 ])  # fmt: skip
 def test_uneven_time(times: list[float], tolerance: float, message: str) -> None:
     rows = time_rows(times)
-    assert refusal(rows.sample_rate_hz, 0, tolerance).startswith(message)
+    assert refusal(rows.sample_grid, 0, tolerance).startswith(message)
 
 
 def test_even_time() -> None:
     rows = time_rows([float(f"{k / 3000:.4f}") for k in range(301)])
-    assert rows.sample_rate_hz(0, 0.5) == pytest.approx(3000.0)
+    rate_hz, samples = rows.sample_grid(0, 0.5)
+    assert rate_hz == pytest.approx(3000.0)
+    assert samples.tolist() == list(range(301))
+
+
+def test_missing_rows_are_gaps_of_the_grid_up_to_a_share():
+    kept = np.delete(np.arange(301), [100, 101, 200])
+    rows = time_rows([float(f"{k / 3000:.4f}") for k in kept])
+    rate_hz, samples = rows.sample_grid(0, 0.5, most_missing=0.01)
+    assert rate_hz == pytest.approx(3000.0)
+    assert samples.tolist() == kept.tolist()
+    assert refusal(rows.sample_grid, 0, 0.5, 1.0, 0.009).startswith("t.csv:101:")
+    assert refusal(time_rows([*range(299), 1e300]).sample_grid, 0, 0.5, 1.0, 0.01)
 
 
 def test_units_have_factors():
@@ -167,9 +179,9 @@ def test_names(table, text: str, names: list[str]) -> None:
     ("1,2\n-inf,3\n", "t.csv:2: column 1: must be a finite number, got -inf"),
     ("1,words\n-inf,3\n", "t.csv:2: column 1: must be a finite number, got -inf"),
     ("1;2\n1.5;3\n1,5;3\n1.5;3\n", "t.csv:3: column 1: must be a finite number, got '1,5'"),
-    ("1,2\n3\n", "t.csv:2: must have 2 columns, as the others have, got 1: '3'"),
+    ("1,2\n3\n5,6\n", "t.csv:2: must have 2 columns, as the others have, got 1: '3'"),
     ("1,2\n3,4,5\n", "t.csv:2: must have 2 columns, as the others have, got 3: '3,4,5'"),
-    ("1,2\n" + "x" * 200_000 + ",1\n",
+    ("1,2\n" + "x" * 200_000 + ",1\n3,4\n",
      f"t.csv:2: must have 2 columns, as the others have, got 0: '{'x' * 57}...'"),
 ])  # fmt: skip
 def test_mistakes_have_their_line(table, text: str, message: str) -> None:
@@ -183,7 +195,7 @@ def test_nothing(table, text: str) -> None:
 
 
 def test_what_is_not_asked_for_may_be_anything(table) -> None:
-    made = table("t,label\n1,up\n2,down\n3,\nthe end\n")
+    made = table("t,label\n1,up\n2,down\n3,\nthe end\n4,up\n")
     found = made.read([0], 1, 3)
     np.testing.assert_array_equal(found.values, [[1.0, 2.0, 3.0]])
     assert found.lines.tolist() == [2, 3, 4]
@@ -297,3 +309,46 @@ def test_gaps_of_one_column_are_accepted(table, tmp_path, cell):
     np.testing.assert_array_equal(arrays.read([0, 1], gaps=1).values[1], expected)
     with pytest.raises(DataError, match="row 4: x"):
         arrays.read([0, 1])
+
+
+@pytest.mark.parametrize(
+    "mark", ["∞", "-∞", "inf", "OL", "Overload", "over range", "---", "1.#INF"]
+)
+@pytest.mark.parametrize("at", [0, 7, 19])
+def test_overload_marks_are_gaps_in_a_column_that_may_have_them(table, mark, at):
+    made = table("t,x,y\n" + "".join(f"{k},{mark if k == at else k},{k}\n" for k in range(20)))
+    assert made.names == ["t", "x", "y"]
+    expected = np.where(np.arange(20) == at, np.nan, np.arange(20.0))
+    np.testing.assert_array_equal(made.read([0, 1], gaps=1).values[1], expected)
+    with pytest.raises(RowError) as caught:
+        made.read([0, 1])
+    assert (caught.value.row, caught.value.count) == (at + 1, 20)
+    setting = f"last_row={at}" if at > 9 else f"first_row={at + 2}"
+    assert str(caught.value.without("table.")).endswith(f"table.{setting}")
+
+
+@pytest.mark.parametrize("end", [
+    "20,2", "20,2\n", "20", "20,2.00,3", "20,2.00,3.5", "End of file\n", "End,of,file",
+    ",,\nEnd of file\n", "20,2" + 40 * "\0",
+])  # fmt: skip
+def test_a_row_cut_short_and_a_footer_are_skipped_with_a_warning(table, caplog, end):
+    made = table("t,x,y\n" + "".join(f"{k},{k}.00,{k}.50\n" for k in range(20)) + end)
+    found = made.read([0, 1, 2])
+    assert found.lines.tolist() == list(range(2, 22))
+    (warning,) = caplog.messages
+    assert "t.csv:22:" in warning
+
+
+@pytest.mark.parametrize("end", ["20,20.00,3.50", "20,20.00,20.5\n", "20,20.00,20.512"])
+def test_a_whole_last_row_is_kept(table, end):
+    made = table("t,x,y\n" + "".join(f"{k},{k}.00,{k}.50\n" for k in range(20)) + end)
+    assert made.read([0]).lines.size == 21
+
+
+def test_columns_without_a_row_that_has_them_all_are_refused(table):
+    assert refusal(table, "1,a\nb,2\n").startswith("t.csv: holds no row")
+
+
+def test_utf_16_cut_within_a_character_is_read(table):
+    text = "t;x\n" + "".join(f"{k};{k}.50\n" for k in range(20)) + "20;2"
+    assert table(text.encode("utf-16")[:-1]).read([0]).lines.size == 20

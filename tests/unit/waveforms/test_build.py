@@ -365,6 +365,24 @@ class TestTextRefused:
         text = refusal(read, rows(WAVE), file_rate_hz=1e3, first_row=200)
         assert "two rows" in text
 
+    def test_missing_rows(self, read: Read) -> None:
+        """A reference is not interpolated unless asked for."""
+        text = refusal(
+            read, "t_s,x\n" + rows(np.delete(T_S, 150), np.delete(WAVE, 150)), column="x"
+        )
+        assert text.startswith("152: samples must be evenly spaced")
+
+    def test_invalid_row_and_the_key_that_omits_it(self, read: Read) -> None:
+        content = rows(WAVE[:150]) + "OL\n" + rows(WAVE[151:])
+        text = refusal(read, content, file_rate_hz=RATE_HZ)
+        assert text.startswith("151: column 1")
+        assert text.endswith("last_row=150")
+        assert read(content, file_rate_hz=RATE_HZ, last_row=150).values.size == 150
+
+    def test_row_cut_short_is_no_sample(self, read: Read) -> None:
+        whole = "".join(f"{value:.6f}\n" for value in WAVE)
+        np.testing.assert_array_equal(read(whole[:-4], file_rate_hz=RATE_HZ).values, WAVE[:-1])
+
 
 class TestRate:
     def test_contradiction(self, read: Read) -> None:

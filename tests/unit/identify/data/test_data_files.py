@@ -298,3 +298,37 @@ def test_a_history_from_an_unknown_state_is_evaluated_once_its_motion_determines
     command = bias + np.linspace(*envelope, 1000) * np.sin(0.02 * np.pi * np.arange(1000))
     found = data_files.from_known_state(History("h", command, 5.0 * command, 100.0))
     assert found.ignore == pytest.approx(ignored, abs=5)
+
+
+def test_missing_rows_are_interpolated_and_not_evaluated(tmp_path):
+    kept = np.delete(np.arange(600), [200, 201, 202, 500])
+    lines = [f"{k / 200},{3 * k},{'OL' if k == 550 else 2 * k}" for k in kept]
+    history = read_table(
+        write(tmp_path, ["t_s,current_a,displacement_um", *lines]), TableSettings()
+    ).history
+    assert history.sample_rate_hz == pytest.approx(200.0)
+    np.testing.assert_allclose(history.command, 3.0 * np.arange(600))
+    np.testing.assert_allclose(history.displacement_um, 2.0 * np.arange(600))
+    np.testing.assert_array_equal(history.held, [200, 201, 202, 500, 550])
+    assert not history.evaluated()[[200, 203, 500, 550]].any()
+
+
+def test_more_missing_rows_are_refused_with_the_first(tmp_path):
+    lines = [f"{k / 200},{k % 50},{2 * k}" for k in range(600) if not 300 <= k < 310]
+    path = write(tmp_path, ["t_s,current_a,displacement_um", *lines])
+    with pytest.raises(DataError, match=r"t\.csv:302: samples must be evenly spaced"):
+        read_table(path, TableSettings())
+
+
+@pytest.mark.parametrize(("bad", "rows"), [(10, 189), (190, 190)])
+def test_the_setting_that_omits_an_invalid_row_works(tmp_path, bad, rows):
+    lines = [f"{k / 200},{'OL' if k == bad else k % 50},{2 * k}" for k in range(200)]
+    path = write(tmp_path, ["t_s,current_a,displacement_um", *lines, "Total,200,"])
+    settings = {"last_row": 200}
+    with pytest.raises(DataError, match=r"t\.csv:202: .* --set table\.last_row=200$"):
+        read_table(path, TableSettings(first_row=100 if bad < 100 else 195))
+    with pytest.raises(DataError) as caught:
+        read_table(path, TableSettings(**settings))
+    key, value = str(caught.value).rpartition("--set table.")[2].split("=")
+    history = read_table(path, TableSettings(**settings | {key: int(value)})).history
+    assert history.command.size == rows
