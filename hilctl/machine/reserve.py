@@ -15,21 +15,23 @@ class Reserve:
     """What a process holds until it lacks it: one per process, see :data:`RESERVE`."""
 
     def __init__(self) -> None:
-        self._held = False
+        self.thread: Thread | None = None
+        """The held thread."""
         self._descriptors: list[int] = []
         self._work: SimpleQueue[tuple[Callable[[], object], Event]] = SimpleQueue()
         self._idle = Semaphore(0)
 
     def hold(self) -> None:
         """Take the reserve, unless it was taken; raise OSError or RuntimeError if that fails."""
-        if self._held:
+        if self.thread is not None:
             return
         import resource  # noqa: F401  so that release() finds it imported; other systems lack it
 
         self._descriptors = [os.open(os.devnull, os.O_RDONLY) for _ in range(_DESCRIPTORS)]
         # A new thread would need memory. A daemon, so that a blocked one does not keep the process.
-        Thread(target=self._serve, name="reserve", daemon=True).start()
-        self._held = True
+        thread = Thread(target=self._serve, name="reserve", daemon=True)
+        thread.start()
+        self.thread = thread
 
     def run(self, work: Callable[[], object]) -> Event:
         """Call ``work`` in the held thread; in a new one if that is busy, or not held.

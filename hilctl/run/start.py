@@ -28,6 +28,7 @@ from hilctl.base.subprocesses import python_command
 from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.load import LoadedExperiment, input_files, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, check
+from hilctl.machine.reserve import RESERVE
 from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends
 from hilctl.run.control.client import HANG_UP, ask, finish_dead_runs, request
@@ -199,8 +200,9 @@ _FORWARDED = (signal.SIGINT, signal.SIGTERM, HANG_UP)
 
 def has_threads() -> bool:
     """Return whether this program has other threads, or the caller is not its main one."""
-    here = threading.current_thread()
-    return threading.active_count() > 1 or here is not threading.main_thread()
+    main = threading.main_thread()
+    others = {*threading.enumerate()} - {main, RESERVE.thread}
+    return bool(others) or threading.current_thread() is not main
 
 
 def run_in_own_process(given: Given, on_progress: Callable[[Progress], None]) -> RunResult:

@@ -81,13 +81,16 @@ def test_without_a_recording_all_that_moved_is_lost(tmp_path):
 
 
 GOOD = {"lost": 0, "beyond_ramp_s": 0.1, "largest_step": 0.9, "reader": "", "hit": "kill loop"}
+GOOD |= {"readable_s": 1.0, "is_false": False}
 
 
 @pytest.mark.parametrize("change", [
     {"lost": 1},
     {"beyond_ramp_s": 0.3},
     {"largest_step": 1.1},
+    {"readable_s": 5.1},
     {"reader": other_reader.NOT_INSTALLED},
+    {"is_false": True},
     {"hit": f"kill loop{STAYS}"},
 ])  # fmt: skip
 def test_each_of_them_is_a_violation(change):

@@ -181,3 +181,12 @@ def test_display_that_fails_ends_no_run(answering):
     with pytest.raises(InputError, match="done"):
         run_in_own_process(GIVEN, show)
     assert shown == [0]
+
+
+def test_the_thread_of_the_reserve_is_no_reason_for_another_process(monkeypatch):
+    main, reserve, other = threading.main_thread(), threading.Thread(), threading.Thread()
+    monkeypatch.setattr(start.RESERVE, "thread", reserve)
+    monkeypatch.setattr(threading, "current_thread", lambda: main)
+    for others, expected in (((), False), ((reserve,), False), ((reserve, other), True)):
+        monkeypatch.setattr(threading, "enumerate", lambda others=others: [main, *others])
+        assert has_threads() == expected
