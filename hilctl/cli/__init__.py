@@ -39,6 +39,10 @@ def main() -> None:
         os.environ.setdefault(name, value)
     take_verbosity(sys.argv)
     acts = any(name in ACTING for name in sys.argv[1:2])
+    if acts and hasattr(signal, "SIGTTOU"):
+        # With stty tostop, output of a background job would suspend it: a supervisor, or a command
+        # between its runs.
+        signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     with safe_streams(acts=acts), output_as_requested(as_json="--json" in sys.argv):
         try:
             _run_app()

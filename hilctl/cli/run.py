@@ -84,8 +84,6 @@ def run(
         _detach(experiment, output, settings, flags, as_json=as_json)
         return
     require_linux()
-    # With stty tostop, output of a background job would stop the supervisor.
-    signal.signal(signal.SIGTTOU, signal.SIG_IGN)
     finish_dead_runs()
     with compile_progress():
         with ExitStack() as stack:

@@ -39,6 +39,11 @@ class Shell:
         while text not in self.read(0.05):
             assert time.monotonic() < deadline, self.text
 
+    def await_end(self):
+        """Wait until the commands in the background have ended."""
+        self.type("wait; echo no''jobs\n")
+        self.await_text("nojobs\r\n")
+
     def close(self):
         os.kill(self.process, signal.SIGHUP)
         os.close(self.terminal)
@@ -85,3 +90,13 @@ def test_a_run_in_the_background_of_the_shell_does_not_freeze(shell, tmp_path, o
         assert time.monotonic() < deadline
     assert hilctl("stop", "--wait", "30")["ended"]
     assert read(tmp_path / "run.mcap").end["code"] == "stopped"
+    shell.await_end()
+
+
+def test_several_runs_in_the_background_of_the_shell_do_not_freeze(shell, tmp_path):
+    """The command writes its progress before the first run, and between them."""
+    words = f"run.yaml --output {tmp_path}/model.yaml --folder {tmp_path}/runs"
+    shell.type(f"{sys.executable} -m hilctl characterise {words} &\n")
+    await_state("running")
+    assert hilctl("stop", "--wait", "30")["ended"]
+    shell.await_end()
