@@ -12,10 +12,20 @@ Source: "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonli
 Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.
 """
 
+from typing import TypeAlias
+
 import numpy as np
 
 from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
+
+Plays: TypeAlias = tuple[float, float, F64, F64]
+"""Widening for a change of 1 between samples (gamma times the sample rate; 0 for the
+rate-independent model), weight of the input itself (a_0), thresholds (rising, in the unit of the
+input) and weights, float64[m] each."""
+Deadbands: TypeAlias = tuple[float, F64, F64, F64, F64]
+"""g_0; thresholds (rising, > 0) and weights on the side above 0; thresholds (falling, < 0) and
+weights on the side below. Thresholds are in the unit of the input."""
 
 
 @kernel()
@@ -49,12 +59,9 @@ def _weigh(weights: F64, values: F64) -> float:
 
 
 @kernel(inline=True)
-def deadband_value(x: float, slope: float, d_up: F64, g_up: F64, d_down: F64, g_down: F64) -> float:
-    """Evaluate the memoryless function Lambda, a weighted sum of deadband operators (6.6).
-
-    ``slope`` is g_0; ``d_up`` (rising, > 0) and ``d_down`` (falling, < 0) are thresholds in the
-    unit of ``x``, and ``g_up`` and ``g_down`` their weights.
-    """
+def deadband_value(x: float, deadbands: Deadbands) -> float:
+    """Evaluate the memoryless function Lambda, a weighted sum of deadband operators (6.6)."""
+    slope, d_up, g_up, d_down, g_down = deadbands
     total = slope * x
     j = 0
     while j < d_up.size and x > d_up[j]:
@@ -68,12 +75,10 @@ def deadband_value(x: float, slope: float, d_up: F64, g_up: F64, d_down: F64, g_
 
 
 @kernel(inline=True)
-def deadband_block(
-    x: F64, slope: float, d_up: F64, g_up: F64, d_down: F64, g_down: F64, out: F64
-) -> None:
+def deadband_block(x: F64, deadbands: Deadbands, out: F64) -> None:
     """Evaluate :func:`deadband_value` for each element of ``x`` into ``out``, both float64[n]."""
     for k in range(x.size):
-        out[k] = deadband_value(x[k], slope, d_up, g_up, d_down, g_down)
+        out[k] = deadband_value(x[k], deadbands)
 
 
 @kernel()
@@ -82,8 +87,8 @@ def play_sum_shared(
 ) -> None:
     """Sum weighted plays whose widening, float64[n] >= 0, is given for each sample.
 
-    Two sums with the same widening cancel exactly if one is the other's inverse. The other
-    arguments are those of :func:`play_sum`.
+    Two sums with the same widening cancel exactly if one is the other's inverse. ``direct``,
+    ``thresholds`` and ``weights`` are those of :data:`Plays`.
     """
     for k in range(v.size):
         now = v[k]
@@ -93,16 +98,12 @@ def play_sum_shared(
 
 
 @kernel(inline=True)
-def play_sum(
-    v: F64, rate_gain: float, direct: float, thresholds: F64, weights: F64, memory: F64, out: F64
-) -> None:
+def play_sum(v: F64, plays: Plays, memory: F64, out: F64) -> None:
     """Sum weighted plays whose thresholds widen with the input's own rate (3.6, 5.5).
 
-    ``rate_gain`` is the widening for a change of 1 between samples: gamma times the sample rate; 0
-    for the rate-independent model. ``direct`` is the weight of the input itself, a_0.
-    ``thresholds`` (rising, in the unit of ``v``) and ``weights`` are float64[m], ``v`` and ``out``
-    float64[n].
+    ``v`` and ``out`` are float64[n].
     """
+    rate_gain, direct, thresholds, weights = plays
     for k in range(v.size):
         now = v[k]
         _move_plays(now, _widening(now - memory[thresholds.size], rate_gain), thresholds, memory)
@@ -143,102 +144,44 @@ def stop_sum(v: F64, direct: float, thresholds: F64, weights: F64, memory: F64, 
 
 
 @kernel()
-def integrated_forward(
-    v: F64,
-    rate_gain: float,
-    direct: float,
-    thresholds: F64,
-    weights: F64,
-    slope: float,
-    d_up: F64,
-    g_up: F64,
-    d_down: F64,
-    g_down: F64,
-    memory: F64,
-    out: F64,
-) -> None:
-    """Run the integrated model Omega[v] = Lambda(Pi[v]) (6.5).
-
-    Args as for :func:`play_sum` and :func:`deadband_value`; ``v`` and ``out`` are float64[n].
-    """
-    play_sum(v, rate_gain, direct, thresholds, weights, memory, out)
-    deadband_block(out, slope, d_up, g_up, d_down, g_down, out)
+def integrated_forward(v: F64, plays: Plays, deadbands: Deadbands, memory: F64, out: F64) -> None:
+    """Run the integrated model Omega[v] = Lambda(Pi[v]) (6.5); ``v`` and ``out`` are float64[n]."""
+    play_sum(v, plays, memory, out)
+    deadband_block(out, deadbands, out)
 
 
 @kernel()
-def integrated_inverse(
-    y: F64,
-    slope: float,
-    d_up: F64,
-    g_up: F64,
-    d_down: F64,
-    g_down: F64,
-    rate_gain: float,
-    direct: float,
-    thresholds: F64,
-    weights: F64,
-    memory: F64,
-    out: F64,
-) -> None:
+def integrated_inverse(y: F64, deadbands: Deadbands, plays: Plays, memory: F64, out: F64) -> None:
     """Run the integrated inverse Omega^-1[y] = Pi^-1[Lambda^-1(y)] (6.17).
 
     The parameters are those of the inverse operators; ``y`` and ``out`` are float64[n]. The
     previous input in ``memory`` is that of the plays, Lambda^-1(y).
     """
-    deadband_block(y, slope, d_up, g_up, d_down, g_down, out)
-    play_sum(out, rate_gain, direct, thresholds, weights, memory, out)
+    deadband_block(y, deadbands, out)
+    play_sum(out, plays, memory, out)
 
 
 @kernel()
 def butterfly_forward(
-    v: F64,
-    rate_gain: float,
-    direct: float,
-    thresholds: F64,
-    weights: F64,
-    bias: float,
-    slope: float,
-    d_up: F64,
-    g_up: F64,
-    d_down: F64,
-    g_down: F64,
-    memory: F64,
-    out: F64,
+    v: F64, plays: Plays, bias: float, deadbands: Deadbands, memory: F64, out: F64
 ) -> None:
-    """Run S(|Pi[v] + bias|): plays, then an even function.
-
-    Args as for :func:`play_sum` and :func:`deadband_value`; ``v`` and ``out`` are float64[n].
-    """
-    play_sum(v, rate_gain, direct, thresholds, weights, memory, out)
+    """Run S(|Pi[v] + bias|): plays, then an even function; ``v`` and ``out`` are float64[n]."""
+    play_sum(v, plays, memory, out)
     for k in range(v.size):
-        out[k] = deadband_value(abs(out[k] + bias), slope, d_up, g_up, d_down, g_down)
+        out[k] = deadband_value(abs(out[k] + bias), deadbands)
 
 
 @kernel()
 def butterfly_inverse(
-    y: F64,
-    slope: float,
-    d_up: F64,
-    g_up: F64,
-    d_down: F64,
-    g_down: F64,
-    wing: float,
-    bias: float,
-    rate_gain: float,
-    direct: float,
-    thresholds: F64,
-    weights: F64,
-    memory: F64,
-    out: F64,
+    y: F64, deadbands: Deadbands, wing: float, bias: float, plays: Plays, memory: F64, out: F64
 ) -> None:
     """Run the inverse of :func:`butterfly_forward` on one wing, 1.0 or -1.0; y < 0 counts as 0.
 
     The parameters are those of the inverse operators; ``y`` and ``out`` are float64[n].
     """
     for k in range(y.size):
-        above = max(y[k], 0.0)
-        out[k] = deadband_value(above, slope, d_up, g_up, d_down, g_down) * wing - bias
-    play_sum(out, rate_gain, direct, thresholds, weights, memory, out)
+        out[k] = deadband_value(max(y[k], 0.0), deadbands) * wing - bias
+    play_sum(out, plays, memory, out)
 
 
 def rest_memory(operators: int) -> F64:

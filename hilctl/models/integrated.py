@@ -10,6 +10,7 @@ from hilctl.base.errors import ModelError
 from hilctl.base.strict import CheckedModel, ValidationError
 from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import (
+    Deadbands,
     butterfly_forward,
     butterfly_inverse,
     deadband_block,
@@ -48,8 +49,8 @@ class DeadbandFunction(CheckedModel):
         yield from _slope_problems(self.slope, self.up_weights, "")
         yield from _slope_problems(self.slope, self.down_weights, "-")
 
-    def arrays(self) -> tuple[float, F64, F64, F64, F64]:
-        """Return the parameters in the order of the kernels."""
+    def packed(self) -> Deadbands:
+        """Return the parameters in the form of the kernels."""
         return (
             self.slope,
             np.array(self.up_thresholds, dtype=np.float64),
@@ -61,7 +62,7 @@ class DeadbandFunction(CheckedModel):
     def __call__(self, x: F64) -> F64:
         """Return Lambda(x), float64[n] for float64[n]."""
         out = np.empty_like(x)
-        deadband_block(x, *self.arrays(), out)
+        deadband_block(x, self.packed(), out)
         return out
 
     def inverse(self) -> "DeadbandFunction":
@@ -117,18 +118,14 @@ class IntegratedModel(RateDependentPlays):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return Omega, from command to um, at rest (6.5)."""
-        rate_gain = self.threshold_growth_s * sample_rate_hz
-        plays = (rate_gain, self.direct, np.array(self.thresholds), np.array(self.weights))
-        parameters = (*plays, *self.deadband.arrays())
+        parameters = (self.packed(sample_rate_hz), self.deadband.packed())
         return Operator(
             integrated_forward, parameters, self.operators, output_offset=self.output_offset_um
         )
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return Omega^-1, from um to command, at rest (6.17)."""
-        direct, weights, thresholds = self.inverse_parameters()
-        rate_gain = self.inverse_rate_gain(sample_rate_hz)
-        parameters = (*self.deadband.inverse().arrays(), rate_gain, direct, thresholds, weights)
+        parameters = (self.deadband.inverse().packed(), self.packed_inverse(sample_rate_hz))
         return Operator(
             integrated_inverse, parameters, self.operators, input_offset=-self.output_offset_um
         )
@@ -210,9 +207,7 @@ class ButterflyModel(RateDependentPlays):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        weights, thresholds = np.array(self.weights), np.array(self.thresholds)
-        rate_gain, direct = self.threshold_growth_s * sample_rate_hz, self.direct
-        parameters = (rate_gain, direct, thresholds, weights, self.bias, *self.shape.arrays())
+        parameters = (self.packed(sample_rate_hz), self.bias, self.shape.packed())
         return Operator(
             butterfly_forward, parameters, self.operators, output_offset=self.output_offset_um
         )
@@ -230,8 +225,6 @@ class ButterflyModel(RateDependentPlays):
                 "a butterfly can be inverted on one of its wings only: output_range_um must begin "
                 f"at {turning_um!r} µm, where they meet, or above: {given}"
             )
-        direct, weights, thresholds = self.inverse_parameters()
-        rate_gain = self.inverse_rate_gain(sample_rate_hz)
-        shape = self.shape.inverse().arrays()
-        parameters = (*shape, self.wing, self.bias, rate_gain, direct, thresholds, weights)
+        shape, plays = self.shape.inverse().packed(), self.packed_inverse(sample_rate_hz)
+        parameters = (shape, self.wing, self.bias, plays)
         return Operator(butterfly_inverse, parameters, self.operators, input_offset=-turning_um)

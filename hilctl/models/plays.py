@@ -9,7 +9,7 @@ from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, StrictModel
 from hilctl.base.types import F64
 from hilctl.kernels.generalised_play import envelope_forward, envelope_inverse
-from hilctl.kernels.hysteresis import play_sum, stop_sum
+from hilctl.kernels.hysteresis import Plays, play_sum, stop_sum
 from hilctl.models.base import (
     HysteresisModel,
     Operator,
@@ -83,17 +83,25 @@ class PlayModel(HysteresisModel):
         """Return the inverse's direct weight, weights and thresholds, see :func:`inverse_plays`."""
         return inverse_plays(self.direct, np.array(self.weights), np.array(self.thresholds))
 
+    def packed(self, sample_rate_hz: float) -> Plays:
+        """Return the plays in the form of the kernels."""
+        rate_gain = self.threshold_growth_s * sample_rate_hz
+        return rate_gain, self.direct, np.array(self.thresholds), np.array(self.weights)
+
+    def packed_inverse(self, sample_rate_hz: float) -> Plays:
+        """Return the plays of the inverse in the form of the kernels."""
+        direct, weights, thresholds = self.inverse_parameters()
+        return self.inverse_rate_gain(sample_rate_hz), direct, thresholds, weights
+
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        rate_gain = self.threshold_growth_s * sample_rate_hz
-        plays = (rate_gain, self.direct, np.array(self.thresholds), np.array(self.weights))
-        return Operator(play_sum, plays, self.operators, output_offset=self.output_offset_um)
+        plays = self.packed(sample_rate_hz)
+        return Operator(play_sum, (plays,), self.operators, output_offset=self.output_offset_um)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
-        direct, weights, thresholds = self.inverse_parameters()
-        plays = (self.inverse_rate_gain(sample_rate_hz), direct, thresholds, weights)
-        return Operator(play_sum, plays, self.operators, input_offset=-self.output_offset_um)
+        plays = self.packed_inverse(sample_rate_hz)
+        return Operator(play_sum, (plays,), self.operators, input_offset=-self.output_offset_um)
 
 
 class PpiModel(PlayModel):

@@ -52,7 +52,7 @@ def published(data: list[SteadyLoop], starts: int, seed: int) -> tuple[Integrate
         alpha, gamma_s, a_0, alpha_0, beta_0, alpha_1, beta_1, d_p, alpha_2, beta_2, d_n = x
         inner = prepared.play_sum(a_0, alpha * steps, alpha_0 * np.exp(-beta_0 * steps), gamma_s)
         up, down = -alpha_1 * np.exp(-beta_1 * k), alpha_2 * np.exp(-beta_2 * k)
-        deadband_block(inner, 1.0, d_p * k, up, -d_n * k, down, out)
+        deadband_block(inner, (1.0, d_p * k, up, -d_n * k, down), out)
         return out - prepared.target_um
 
     rng = np.random.default_rng(seed)

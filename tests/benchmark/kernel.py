@@ -41,9 +41,7 @@ def inverse_parameters() -> tuple[Any, ...]:
         alpha=0.3, gamma_s=2e-4, a_0=1.0, alpha_0=0.2, beta_0=0.3, g_0=6.0,
         alpha_1=0.3, beta_1=0.1, d_p=0.8, alpha_2=0.4, beta_2=0.1, d_n=0.8,
     )  # fmt: skip
-    direct, weights, thresholds = model.inverse_parameters()
-    deadband = model.deadband.inverse().arrays()
-    return (*deadband, model.inverse_rate_gain(SAMPLE_RATE_HZ), direct, thresholds, weights)
+    return model.deadband.inverse().packed(), model.packed_inverse(SAMPLE_RATE_HZ)
 
 
 def numba_run(
@@ -59,7 +57,7 @@ def c_run(
     library: Path, y: np.ndarray, parameters: tuple[Any, ...], memory: np.ndarray, out: np.ndarray
 ) -> Run:
     """Return the C function, bound to its arguments; after its arrays go their lengths."""
-    slope, d_up, g_up, d_down, g_down, gain, direct, thresholds, weights = parameters
+    (slope, d_up, g_up, d_down, g_down), (gain, direct, thresholds, weights) = parameters
     number, size, array = ctypes.c_double, ctypes.c_ssize_t, np.ctypeslib.ndpointer(np.float64)
     function = ctypes.CDLL(str(library)).integrated_inverse
     function.restype = None

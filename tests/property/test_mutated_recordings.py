@@ -430,7 +430,7 @@ def test_damaged_recordings_are_read_or_rejected(tmp_path, part):
 def check_bounds(folder: Path) -> None:
     """Run the kernels of damaged recordings; they must be compiled with bounds checks."""
     with pytest.raises(IndexError):
-        play_sum(np.zeros(4), 0.0, 1.0, np.ones(3), np.ones(3), np.zeros(1), np.zeros(4))
+        play_sum(np.zeros(4), (0.0, 1.0, np.ones(3), np.ones(3)), np.zeros(1), np.zeros(4))
     path = folder / "damaged.mcap"
     found = []
     for number in range(CHECKED_FILES):

@@ -315,7 +315,7 @@ class ExponentialProblem:
         inner = data.play_sum(known["a_0"], thresholds, self._play_weights(x), known["gamma"])
         (up, g_up), (down, g_down) = self._side(x[5:8], -1.0), self._side(x[8:11], 1.0)
         out = np.empty_like(inner)
-        deadband_block(inner, 1.0, up, g_up, -down, g_down, out)
+        deadband_block(inner, (1.0, up, g_up, -down, g_down), out)
         return out + (known.get("output_offset_um", 0.0) - data.target_um)
 
     def slopes_um(self, x: F64, scale: F64) -> F64:

@@ -13,6 +13,8 @@ RATE_HZ = 5_000.0
 D_UP, G_UP = np.array([0.4, 1.1, 1.9]), np.array([-0.2, -0.3, 0.1])
 D_DOWN, G_DOWN = np.array([-0.3, -1.4]), np.array([0.25, -0.4])
 SLOPE = 1.7
+PLAYS = (GROWTH_S * RATE_HZ, DIRECT, THRESHOLDS, WEIGHTS)
+DEADBANDS = (SLOPE, D_UP, G_UP, D_DOWN, G_DOWN)
 
 
 @pytest.fixture
@@ -116,7 +118,7 @@ def test_stop_sum_follows_its_equation(signal):
 def test_play_sum_widens_with_its_own_rate(signal, rate_gain):
     """Thresholds are r_i + gamma |v'|; gamma 0 is the rate-independent model (3.6, 5.5)."""
     growth = widenings(signal) if rate_gain else np.zeros(signal.size)
-    out = run(hysteresis.play_sum, signal, rate_gain, DIRECT, THRESHOLDS, WEIGHTS)
+    out = run(hysteresis.play_sum, signal, (rate_gain, *PLAYS[1:]))
     close(out, plays_weighed(signal, growth))
 
 
@@ -124,7 +126,7 @@ def test_play_sum_shared_takes_the_widening_it_is_given(signal):
     growth = widenings(signal)
     shared = hysteresis.play_sum_shared
     own = run(shared, signal, growth, DIRECT, THRESHOLDS, WEIGHTS)
-    close(own, run(hysteresis.play_sum, signal, GROWTH_S * RATE_HZ, DIRECT, THRESHOLDS, WEIGHTS))
+    close(own, run(hysteresis.play_sum, signal, PLAYS))
     other = run(shared, signal, growth[::-1].copy(), DIRECT, THRESHOLDS, WEIGHTS)
     close(other, plays_weighed(signal, growth[::-1]))
 
@@ -132,7 +134,7 @@ def test_play_sum_shared_takes_the_widening_it_is_given(signal):
 @pytest.mark.parametrize("x", [-5.0, -1.4, -1.0, -0.3, -0.1, -0.0, 0.0, 0.2, 0.4, 1.5, 1.9, 7.0])
 def test_deadband_sum_follows_its_equation(x):
     """Lambda is the sum of the J_d of both signs (6.6), at its corners as well."""
-    value = hysteresis.deadband_value(x, SLOPE, D_UP, G_UP, D_DOWN, G_DOWN)
+    value = hysteresis.deadband_value(x, DEADBANDS)
     assert value == pytest.approx(deadbands(x), rel=1e-14, abs=1e-15)
 
 
@@ -144,30 +146,28 @@ def test_one_deadband_lets_through_what_is_beyond_it(d, x, expected):
     none, one = np.empty(0), np.ones(1)
     up = (np.array([d]), one) if d > 0 else (none, none)
     down = (np.array([d]), one) if d < 0 else (none, none)
-    assert hysteresis.deadband_value(x, 0.0, *up, *down) == expected
+    assert hysteresis.deadband_value(x, (0.0, *up, *down)) == expected
 
 
 def test_deadband_block_is_deadband_value(signal):
     out = np.empty_like(signal)
-    hysteresis.deadband_block(signal, SLOPE, D_UP, G_UP, D_DOWN, G_DOWN, out)
+    hysteresis.deadband_block(signal, DEADBANDS, out)
     close(out, [deadbands(x) for x in signal])
 
 
 def test_integrated_forward_is_plays_then_deadbands(signal):
     """Omega[v] = Lambda(Pi[v]) (6.5)."""
-    out = run(hysteresis.integrated_forward, signal, GROWTH_S * RATE_HZ, DIRECT, THRESHOLDS,
-              WEIGHTS, SLOPE, D_UP, G_UP, D_DOWN, G_DOWN)  # fmt: skip
+    out = run(hysteresis.integrated_forward, signal, PLAYS, DEADBANDS)
     close(out, [deadbands(x) for x in plays_weighed(signal, widenings(signal))])
 
 
 def test_integrated_inverse_is_deadbands_then_plays(signal):
     """Omega^-1[y] = Pi^-1[Lambda^-1(y)] (6.17); the rate is that of Lambda^-1(y)."""
-    out = run(hysteresis.integrated_inverse, signal, SLOPE, D_UP, G_UP, D_DOWN, G_DOWN,
-              GROWTH_S * RATE_HZ, DIRECT, THRESHOLDS, WEIGHTS)  # fmt: skip
+    out = run(hysteresis.integrated_inverse, signal, DEADBANDS, PLAYS)
     x = np.array([deadbands(y) for y in signal])
     close(out, plays_weighed(x, widenings(x)))
 
 
 def test_no_operators_leave_the_direct_part(signal):
-    out = run(hysteresis.play_sum, signal, 1.0, 2.0, np.empty(0), np.empty(0), operators=0)
+    out = run(hysteresis.play_sum, signal, (1.0, 2.0, np.empty(0), np.empty(0)), operators=0)
     np.testing.assert_array_equal(out, 2.0 * signal)

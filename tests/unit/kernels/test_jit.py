@@ -17,11 +17,11 @@ SIGNAL = 2.0 * np.sin(np.arange(400) / 9.0) + 0.6 * np.cos(np.arange(400) / 2.3)
 WIDENING = 0.1 + 0.1 * np.sin(np.arange(400) / 5.0)
 
 STREAMING = {
-    "play_sum": (hysteresis.play_sum, (0.3, *PLAYS)),
+    "play_sum": (hysteresis.play_sum, ((0.3, *PLAYS),)),
     "play_sum_shared": (hysteresis.play_sum_shared, (WIDENING, *PLAYS)),
     "stop_sum": (hysteresis.stop_sum, PLAYS),
-    "integrated_forward": (hysteresis.integrated_forward, (0.3, *PLAYS, *DEADBANDS)),
-    "integrated_inverse": (hysteresis.integrated_inverse, (*DEADBANDS, 0.3, *PLAYS)),
+    "integrated_forward": (hysteresis.integrated_forward, ((0.3, *PLAYS), DEADBANDS)),
+    "integrated_inverse": (hysteresis.integrated_inverse, (DEADBANDS, (0.3, *PLAYS))),
 }
 
 
@@ -77,10 +77,10 @@ def test_scalar_kernels_agree_with_python(v):
 
     @numba.njit
     def caller(v, deadbands):
-        return stop(v, 0.2, 0.4, 0.1), value(v, *deadbands)
+        return stop(v, 0.2, 0.4, 0.1), value(v, deadbands)
 
-    expected = (stop.py_func(v, 0.2, 0.4, 0.1), value.py_func(v, *DEADBANDS))
-    assert (stop(v, 0.2, 0.4, 0.1), value(v, *DEADBANDS)) == expected
+    expected = (stop.py_func(v, 0.2, 0.4, 0.1), value.py_func(v, DEADBANDS))
+    assert (stop(v, 0.2, 0.4, 0.1), value(v, DEADBANDS)) == expected
     assert caller(v, DEADBANDS) == expected
 
 
