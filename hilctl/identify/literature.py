@@ -224,12 +224,12 @@ class _GeneralisedPlays(_ShapeSearch):
 
     def solve(self, x: F64) -> tuple[F64, float, F64]:
         """Return p_0 to p_n, the constant displacement, and the error float64[M]."""
-        rising, falling = (envelope.array() for envelope in self.envelopes(x))
-        thresholds = self.thresholds(x)
+        rising, falling = self.envelopes(x)
+        envelopes, thresholds = (rising.array(), falling.array()), self.thresholds(x)
 
         def run(v: F64) -> F64:
             out = np.empty((v.size, self.plays + 1))
-            envelope_outputs(v, rising, falling, thresholds, rest_memory(self.plays + 1), out)
+            envelope_outputs(v, envelopes, thresholds, rest_memory(self.plays + 1), out)
             return out
 
         columns = self.data.stack(run)[self.rows]

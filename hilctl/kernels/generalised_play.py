@@ -14,10 +14,15 @@ Nonlinearities of Magnetostrictive Actuators", Concordia; equation numbers are t
 """
 
 import math
+from typing import TypeAlias
 
 from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
 
+Envelopes: TypeAlias = tuple[F64, F64]
+"""gamma_l and gamma_r: c, k, s and o of each, float64[4], with c and k > 0."""
+EnvelopedPlays: TypeAlias = tuple[float, F64, F64]
+"""p_0, thresholds (rising, in the unit of the envelopes) and weights, float64[m] each."""
 _SATURATED = 1.0 - 1e-12
 
 
@@ -34,14 +39,16 @@ def _inverse_envelope(z: float, shape: F64) -> float:
 
 
 @kernel(inline=True)
-def _hold(v: float, held: float, rising: F64, falling: F64) -> float:
+def _hold(v: float, held: float, envelopes: Envelopes) -> float:
+    rising, falling = envelopes
     low = _envelope(v, rising)
     high = max(low, _envelope(v, falling))
     return max(low, min(high, held))
 
 
 @kernel(inline=True)
-def _sum_of_plays(z: float, direct: float, thresholds: F64, weights: F64, memory: F64) -> float:
+def _sum_of_plays(z: float, plays: EnvelopedPlays, memory: F64) -> float:
+    direct, thresholds, weights = plays
     total = direct * z
     for i in range(thresholds.size):
         memory[i] = max(min(memory[i], z + thresholds[i]), z - thresholds[i])
@@ -51,41 +58,29 @@ def _sum_of_plays(z: float, direct: float, thresholds: F64, weights: F64, memory
 
 @kernel()
 def envelope_forward(
-    v: F64,
-    rising: F64,
-    falling: F64,
-    direct: float,
-    thresholds: F64,
-    weights: F64,
-    memory: F64,
-    out: F64,
+    v: F64, envelopes: Envelopes, plays: EnvelopedPlays, memory: F64, out: F64
 ) -> None:
-    """Run the generalised model (1.20).
-
-    ``rising`` and ``falling`` are float64[4]: c, k, s and o of gamma_l and gamma_r, with c and k
-    > 0. ``direct`` is p_0; ``thresholds`` (rising, in the unit of the envelopes) and ``weights``
-    are float64[m].
-    """
-    m = thresholds.size
+    """Run the generalised model (1.20)."""
+    m = memory.size - 2
     for k in range(v.size):
         now = v[k]
-        z = _hold(now, memory[m], rising, falling)
-        out[k] = _sum_of_plays(z, direct, thresholds, weights, memory)
+        z = _hold(now, memory[m], envelopes)
+        out[k] = _sum_of_plays(z, plays, memory)
         memory[m] = z
         memory[m + 1] = now
 
 
 @kernel()
 def envelope_outputs(
-    v: F64, rising: F64, falling: F64, thresholds: F64, memory: F64, out: F64_2D
+    v: F64, envelopes: Envelopes, thresholds: F64, memory: F64, out: F64_2D
 ) -> None:
     """Record z and each play's output by itself, as regressors for identification.
 
-    Args as for :func:`envelope_forward`; ``out`` is float64[n, m + 1], z first.
+    ``thresholds`` are those of :data:`EnvelopedPlays`; ``out`` is float64[n, m + 1], z first.
     """
     m = thresholds.size
     for k in range(v.size):
-        z = _hold(v[k], memory[m], rising, falling)
+        z = _hold(v[k], memory[m], envelopes)
         memory[m] = z
         memory[m + 1] = v[k]
         out[k, 0] = z
@@ -97,13 +92,9 @@ def envelope_outputs(
 @kernel()
 def envelope_inverse(
     y: F64,
-    rising: F64,
-    falling: F64,
-    low: float,
-    high: float,
-    direct: float,
-    thresholds: F64,
-    weights: F64,
+    envelopes: Envelopes,
+    span: tuple[float, float],
+    plays: EnvelopedPlays,
     memory: F64,
     out: F64,
 ) -> None:
@@ -111,12 +102,14 @@ def envelope_inverse(
 
     While z rises the command follows the inverse of gamma_l, while it falls that of gamma_r; the
     command jumps where z turns and is constant where z is. ``y`` is float64[n], displacement in
-    um; commands stay within ``low`` to ``high``. ``direct``, ``thresholds`` (in um) and
-    ``weights`` are those of the inverse sum of plays.
+    um; commands stay within ``span``. ``plays`` are those of the inverse sum, with thresholds in
+    um.
     """
-    m = thresholds.size
+    rising, falling = envelopes
+    low, high = span
+    m = memory.size - 2
     for k in range(y.size):
-        z = _sum_of_plays(y[k], direct, thresholds, weights, memory)
+        z = _sum_of_plays(y[k], plays, memory)
         upper = _inverse_envelope(z, rising)
         lower = min(upper, _inverse_envelope(z, falling))
         held = memory[m + 1] if abs(memory[m + 1]) >= 0.0 else 0.0

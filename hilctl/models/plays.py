@@ -8,7 +8,7 @@ import numpy as np
 from hilctl.base.errors import ModelError
 from hilctl.base.strict import Field, StrictModel
 from hilctl.base.types import F64
-from hilctl.kernels.generalised_play import envelope_forward, envelope_inverse
+from hilctl.kernels.generalised_play import Envelopes, envelope_forward, envelope_inverse
 from hilctl.kernels.hysteresis import Plays, play_sum, stop_sum
 from hilctl.models.base import (
     HysteresisModel,
@@ -216,10 +216,13 @@ class GeneralisedModel(BoundedInputModel):
         """Number of operators with memory: the plays, and the one of threshold 0."""
         return len(self.weights) + 1
 
+    def _envelopes(self) -> Envelopes:
+        return self.rising.array(), self.falling.array()
+
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest; independent of the rate."""
         plays = self.direct, np.array(self.thresholds), np.array(self.weights)
-        parameters = (self.rising.array(), self.falling.array(), *plays)
+        parameters = (self._envelopes(), plays)
         return Operator(
             envelope_forward, parameters, self.operators, output_offset=self.output_offset_um
         )
@@ -229,8 +232,7 @@ class GeneralisedModel(BoundedInputModel):
         direct, weights, thresholds = inverse_plays(
             self.direct, np.array(self.weights), np.array(self.thresholds)
         )
-        envelopes = self.rising.array(), self.falling.array(), *self.command_span
-        parameters = (*envelopes, direct, thresholds, weights)
+        parameters = (self._envelopes(), self.command_span, (direct, thresholds, weights))
         return Operator(
             envelope_inverse, parameters, self.operators, input_offset=-self.output_offset_um
         )

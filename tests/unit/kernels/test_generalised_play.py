@@ -19,13 +19,13 @@ def rest():
 
 def forward(v, memory):
     out = np.empty_like(v)
-    envelope_forward(v, RISING, FALLING, DIRECT, THRESHOLDS, WEIGHTS, memory, out)
+    envelope_forward(v, (RISING, FALLING), (DIRECT, THRESHOLDS, WEIGHTS), memory, out)
     return out
 
 
 def test_outputs_follow_the_definition():
     out = np.empty((SIGNAL.size, 4))
-    envelope_outputs(SIGNAL, RISING, FALLING, THRESHOLDS, rest(), out)
+    envelope_outputs(SIGNAL, (RISING, FALLING), THRESHOLDS, rest(), out)
     held = np.zeros(4)
     thresholds = np.concatenate(([0.0], THRESHOLDS))
     for k, v in enumerate(SIGNAL):
@@ -37,7 +37,7 @@ def test_outputs_follow_the_definition():
 
 def test_the_sum_is_that_of_its_plays():
     out = np.empty((SIGNAL.size, 4))
-    envelope_outputs(SIGNAL, RISING, FALLING, THRESHOLDS, rest(), out)
+    envelope_outputs(SIGNAL, (RISING, FALLING), THRESHOLDS, rest(), out)
     expected = out @ np.array([DIRECT, *WEIGHTS])
     np.testing.assert_allclose(forward(SIGNAL, rest()), expected, atol=1e-12)
 
@@ -53,7 +53,7 @@ def test_the_inverse_brings_displacements_back_and_stays_in_its_span():
     wanted = 1.8 * np.sin(np.arange(800) / 60.0)
     direct, weights, thresholds = inverse_plays(DIRECT, WEIGHTS, THRESHOLDS)
     command = np.empty_like(wanted)
-    parameters = (RISING, FALLING, -9.0, 9.0, direct, thresholds, weights)
+    parameters = ((RISING, FALLING), (-9.0, 9.0), (direct, thresholds, weights))
     envelope_inverse(wanted, *parameters, rest(), command)
     np.testing.assert_allclose(forward(command, rest())[200:], wanted[200:], atol=1e-9)
     envelope_inverse(100.0 * wanted, *parameters, rest(), command)
