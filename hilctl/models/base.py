@@ -224,6 +224,16 @@ class HysteresisModel(CheckedModel, ABC):
     def operators(self) -> int:
         """Number of operators with memory."""
 
+    def _forward(self, kernel: Callable[..., None], *parameters: Any) -> Operator:
+        """Return a kernel from command to um, at rest."""
+        offset_um = self.output_offset_um
+        return Operator(kernel, parameters, self.operators, output_offset=offset_um)
+
+    def _inverse(self, kernel: Callable[..., None], *parameters: Any) -> Operator:
+        """Return a kernel from um to command, at rest."""
+        offset_um = self.output_offset_um
+        return Operator(kernel, parameters, self.operators, input_offset=-offset_um)
+
     def to_mapping(self) -> dict[str, Any]:
         """Return the parameters as plain mappings, lists and numbers, defaults omitted."""
         return self.model_dump(mode="json", exclude_defaults=True, exclude_none=True)

@@ -64,16 +64,11 @@ class ImplicitModel(BoundedInputModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest; independent of the rate."""
-        return Operator(
-            implicit_forward, self.packed(), self.operators, output_offset=self.output_offset_um
-        )
+        return self._forward(implicit_forward, *self.packed())
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
-        parameters = (*self.packed(), self.command_span, TOLERANCE_UM)
-        return Operator(
-            implicit_inverse, parameters, self.operators, input_offset=-self.output_offset_um
-        )
+        return self._inverse(implicit_inverse, *self.packed(), self.command_span, TOLERANCE_UM)
 
 
 NOTHING = np.zeros(1)

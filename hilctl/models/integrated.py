@@ -118,17 +118,13 @@ class IntegratedModel(RateDependentPlays):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return Omega, from command to um, at rest (6.5)."""
-        parameters = (self.packed(sample_rate_hz), self.deadband.packed())
-        return Operator(
-            integrated_forward, parameters, self.operators, output_offset=self.output_offset_um
-        )
+        plays, deadbands = self.packed(sample_rate_hz), self.deadband.packed()
+        return self._forward(integrated_forward, plays, deadbands)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return Omega^-1, from um to command, at rest (6.17)."""
-        parameters = (self.deadband.inverse().packed(), self.packed_inverse(sample_rate_hz))
-        return Operator(
-            integrated_inverse, parameters, self.operators, input_offset=-self.output_offset_um
-        )
+        deadbands, plays = self.deadband.inverse().packed(), self.packed_inverse(sample_rate_hz)
+        return self._inverse(integrated_inverse, deadbands, plays)
 
 
 def even_thresholds(spacing: float, operators: int) -> F64:
@@ -207,10 +203,8 @@ class ButterflyModel(RateDependentPlays):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        parameters = (self.packed(sample_rate_hz), self.bias, self.shape.packed())
-        return Operator(
-            butterfly_forward, parameters, self.operators, output_offset=self.output_offset_um
-        )
+        plays, shape = self.packed(sample_rate_hz), self.shape.packed()
+        return self._forward(butterfly_forward, plays, self.bias, shape)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest, on one wing of the butterfly.
@@ -226,5 +220,4 @@ class ButterflyModel(RateDependentPlays):
                 f"at {turning_um!r} µm, where they meet, or above: {given}"
             )
         shape, plays = self.shape.inverse().packed(), self.packed_inverse(sample_rate_hz)
-        parameters = (shape, self.wing, self.bias, plays)
-        return Operator(butterfly_inverse, parameters, self.operators, input_offset=-turning_um)
+        return self._inverse(butterfly_inverse, shape, self.wing, self.bias, plays)

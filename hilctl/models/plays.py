@@ -95,13 +95,11 @@ class PlayModel(HysteresisModel):
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest."""
-        plays = self.packed(sample_rate_hz)
-        return Operator(play_sum, (plays,), self.operators, output_offset=self.output_offset_um)
+        return self._forward(play_sum, self.packed(sample_rate_hz))
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest."""
-        plays = self.packed_inverse(sample_rate_hz)
-        return Operator(play_sum, (plays,), self.operators, input_offset=-self.output_offset_um)
+        return self._inverse(play_sum, self.packed_inverse(sample_rate_hz))
 
 
 class PpiModel(PlayModel):
@@ -157,8 +155,7 @@ class SpiModel(PlayModel):
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest; independent of the rate."""
         direct, weights, thresholds = self.stop_parameters()
-        stops = (direct, thresholds, weights)
-        return Operator(stop_sum, stops, weights.size, input_offset=-self.output_offset_um)
+        return self._inverse(stop_sum, direct, thresholds, weights)
 
 
 class PlayEnvelope(StrictModel):
@@ -222,17 +219,12 @@ class GeneralisedModel(BoundedInputModel):
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the operator from command to um, at rest; independent of the rate."""
         plays = self.direct, np.array(self.thresholds), np.array(self.weights)
-        parameters = (self._envelopes(), plays)
-        return Operator(
-            envelope_forward, parameters, self.operators, output_offset=self.output_offset_um
-        )
+        return self._forward(envelope_forward, self._envelopes(), plays)
 
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest: inverse plays, inverse envelopes."""
         direct, weights, thresholds = inverse_plays(
             self.direct, np.array(self.weights), np.array(self.thresholds)
         )
-        parameters = (self._envelopes(), self.command_span, (direct, thresholds, weights))
-        return Operator(
-            envelope_inverse, parameters, self.operators, input_offset=-self.output_offset_um
-        )
+        plays = direct, thresholds, weights
+        return self._inverse(envelope_inverse, self._envelopes(), self.command_span, plays)
