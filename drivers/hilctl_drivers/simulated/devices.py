@@ -63,6 +63,8 @@ class SimulatedFault(StrictModel):
 class SimulatedOptions(DeviceOptions):
     """Options of every simulated device."""
 
+    REMOVED: ClassVar[Mapping[str, str]] = {"physics": "removed, there is one; delete the key"}
+
     seed: int = Field(default=1, ge=0, description="seed of the sensor noise")
     noise: bool = Field(default=True, description="whether the sensor has noise")
     nonlinearity_percent: float = Field(
@@ -275,7 +277,6 @@ _TEMPERATURES = (
 class TerfenolOptions(SimulatedOptions):
     """Options of ``simulated_terfenol``."""
 
-    REMOVED: ClassVar[Mapping[str, str]] = {"physics": "removed, there is one; delete the key"}
     RODS: ClassVar[type[RodParameters]] = PinnedCellsParameters
 
     load_kg: float = Field(default=0.0, ge=0.0, le=100.0, description="mass on the actuator, kg")
@@ -413,7 +414,6 @@ class PiezoStage(DeviceOptions):
 class PiezoOptions(SimulatedOptions):
     """Options of ``simulated_piezo``."""
 
-    REMOVED: ClassVar[Mapping[str, str]] = {"physics": "removed, there is one; delete the key"}
     stage: PiezoStage | None = Field(
         default=None, description="a stage of your own instead of the published P-753.31C"
     )

@@ -91,7 +91,7 @@ def planned(
             # Steps that differ in noise only are checked once; kept steps are not checked again.
             budget_s = each.loaded.config.limits.thermal_time_constant_s
             if each.kept is None or (heat_a2 is None and budget_s is not None):
-                each = _checked(each, known, folder)
+                each = _checked(each, known)
             steps.append(each)
         except ConfigError as error:
             failed += [(step, problem) for problem in error.problems]
@@ -106,9 +106,7 @@ def _loaded(campaign: CampaignSteps, step: CampaignStep, files: TextFiles) -> Pl
     return PlannedStep(step, loaded, settings, RunKey.of(loaded))
 
 
-def _checked(
-    each: PlannedStep, known: dict[tuple[str, ...], PlannedStep], folder: Path
-) -> PlannedStep:
+def _checked(each: PlannedStep, known: dict[tuple[str, ...], PlannedStep]) -> PlannedStep:
     same = known.get(each.step.settings)
     if same is None:
         # Cooled down: heat of the last run causes a pause, not an error.

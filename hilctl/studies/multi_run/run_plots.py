@@ -128,23 +128,19 @@ def _draw_loops(axes: Axes, along: VariedParameter, runs: Sequence[Measured]) ->
         axes.set(xlabel=_input_axis(digest), ylabel=_DISPLACEMENT_AXIS)
 
 
-def _run_sheet(
-    name: str, caption: str, series: RunSeries, runs: Sequence[Measured], draw: Callable[..., None]
-) -> FigureSpec | None:
-    """Return a figure with one panel per run, of a selection of many runs; None without runs."""
+def model_sheet(series: RunSeries) -> FigureSpec | None:
+    """Return measured and modelled loops, with one panel per run, of a selection of many runs.
+
+    None without models.
+    """
+    runs = [each for each in series.measured if each[1].modelled.size]
     panels = tuple(
-        Panel(partial(draw, digest=digest), series.text(run), _SQUARE)
+        Panel(partial(_draw_model, digest=digest), series.text(run), _SQUARE)
         for run, digest in spread(runs, _MOST_PANELS)
     )
     more = f"; {len(panels)} of {len(runs)} runs" if len(panels) < len(runs) else ""
-    return FigureSpec(name, f"{caption}{more}.", panels, alike=True) if panels else None
-
-
-def model_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return measured and modelled loops; None without models."""
-    runs = [each for each in series.measured if each[1].modelled.size]
-    caption = "Measured and modelled loops"
-    return _run_sheet("model_against_measured", caption, series, runs, _draw_model)
+    caption = f"Measured and modelled loops{more}."
+    return FigureSpec("model_against_measured", caption, panels, alike=True) if panels else None
 
 
 def _draw_model(axes: Axes, digest: RunDigest) -> None:
