@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any, TypeAlias
 
 from hilctl.base.errors import DataError, InputError
-from hilctl.base.formatting import printable
+from hilctl.base.formatting import encodable, printable
 from hilctl.base.segments import Segment
 from hilctl.recording.metadata_keys import AUX_FACT, END_FIGURES, LABELS_FACT
 from hilctl.recording.run_summary import read_ends
@@ -156,7 +156,7 @@ def _to_sql(value: Any) -> Any:
     if isinstance(value, dict):
         value = json.dumps(value, ensure_ascii=False)
     # A JSON escape in a recording may be half a character, which is not valid UTF-8.
-    return value.encode(errors="backslashreplace").decode() if isinstance(value, str) else value
+    return encodable(value) if isinstance(value, str) else value
 
 
 def read_catalogue(folder: Path) -> list[Entry]:

@@ -3,6 +3,7 @@
 from collections.abc import Mapping
 from dataclasses import dataclass, field
 
+from hilctl.base.formatting import encodable
 from hilctl.base.samples import Samples
 
 TUNED = "tuned"
@@ -75,6 +76,10 @@ class Event:
     values: Mapping[str, float] = field(default_factory=dict)
     time_ns: int = 0
     before: Samples | None = None
+
+    def __post_init__(self) -> None:
+        """Escape half characters in the text, which may be any error's."""
+        object.__setattr__(self, "text", encodable(self.text))
 
 
 def adapted_text(parameters: Mapping[str, float]) -> str:

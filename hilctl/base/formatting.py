@@ -81,6 +81,11 @@ def printable(text: str, *, lines: bool = False) -> str:
     )
 
 
+def encodable(text: str) -> str:
+    r"""Return a text with half characters escaped (``\ud800``), which UTF-8 cannot encode."""
+    return text.encode(errors="backslashreplace").decode()
+
+
 def short_name(text: str) -> str:
     """Return a printable text of at most :data:`MOST_SHOWN` characters."""
     name = printable(text[: MOST_SHOWN + 1])

@@ -5,6 +5,8 @@ import zlib
 from collections.abc import Mapping
 from typing import TypeAlias
 
+from hilctl.base.formatting import encodable
+
 HOLDS_FACT = "holds"
 """Fact of a run: JSON list of the resources that its device locks."""
 HEAT_FACT = "coil_heat_a2"
@@ -40,7 +42,8 @@ LabelValue: TypeAlias = str | int | float
 
 
 def sealed(name: str, facts: Mapping[str, str]) -> dict[str, str]:
-    """Return the facts of a metadata record with their checksum."""
+    """Return the facts of a metadata record as UTF-8 has them, with their checksum."""
+    facts = {key: encodable(value) for key, value in facts.items()}
     return {**facts, CHECKSUM_FACT: _checksum(name, facts)}
 
 

@@ -20,6 +20,7 @@ from types import FrameType
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
+from hilctl.base.formatting import encodable
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.pacer import deadline_misses
 from hilctl.loop.safe_output import LoopOutcome, describe
@@ -75,7 +76,7 @@ class SystemdNotifier:
             return
         with suppress(OSError), socket.socket(socket.AF_UNIX, socket.SOCK_DGRAM) as out:
             out.setblocking(False)
-            out.sendto("\n".join(lines).encode(), self._address)
+            out.sendto(encodable("\n".join(lines)).encode(), self._address)
 
     def alive(self) -> None:
         """Feed the watchdog three times per interval; call this more often."""

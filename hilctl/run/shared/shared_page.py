@@ -384,7 +384,7 @@ class SharedPage:
         self.publish(PageField.EVENT_TAIL, self._event_tail)
 
     def _write(self, at: int, size: int, text: str) -> None:
-        raw = text.encode()[: size - 8].decode(errors="ignore").encode()
+        raw = text.encode(errors="backslashreplace")[: size - 8].decode(errors="ignore").encode()
         self._map[at + 8 : at + 8 + len(raw)] = raw
         self._map[at : at + 8] = len(raw).to_bytes(8, "little")
 

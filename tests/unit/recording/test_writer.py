@@ -7,6 +7,7 @@ from unittest.mock import Mock
 import pytest
 
 from hilctl.base.events import Event
+from hilctl.recording.metadata_keys import sealed
 from hilctl.recording.reader import read
 from hilctl.recording.writer import OutputFile, PendingFile
 from tests.fakes import FailingFile
@@ -19,6 +20,14 @@ def test_event_has_its_numbers_and_its_time(tmp_path, make):
     due_ns = make.start_ns + 100 * 20_000
     tuned = Event(100, "info", "tuned", "text", values, time_ns=due_ns)
     assert read(path).events == (tuned, make.ended)
+
+
+def test_half_a_character_is_escaped(tmp_path):
+    """An event or an outcome may hold the text of any error."""
+    text, escaped = "no answer: \ud800", r"no answer: \ud800"
+    events = [Event(100, "warning", "noted", text)]
+    assert read(written(tmp_path / "run.mcap", [], events=events)).events[0].text == escaped
+    assert sealed("hilctl.end", {"reason": text})["reason"] == escaped
 
 
 def test_replay_can_start_first_and_after_each_gap(recorded):

@@ -697,6 +697,9 @@ def test_lines_reach_the_service_manager(tmp_path):
         manager.bind(str(tmp_path / "notify"))
         SystemdNotifier({"NOTIFY_SOCKET": str(tmp_path / "notify")}).say("READY=1", "STATUS=fine")
         assert manager.recv(100) == b"READY=1\nSTATUS=fine"
+        recording = os.fsdecode(b"\xff.mcap")  # a name that is not UTF-8
+        SystemdNotifier({"NOTIFY_SOCKET": str(tmp_path / "notify")}).say(f"STATUS={recording}")
+        assert manager.recv(100) == rb"STATUS=\udcff.mcap"
 
 
 def test_watchdog_is_fed_three_times_in_its_interval(tmp_path):

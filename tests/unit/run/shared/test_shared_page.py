@@ -44,6 +44,8 @@ def test_each_text_has_a_place_of_its_own(sides):
     one.write_text(PageSlot.SET_UP, "µ" * 10_000)
     assert set(other.read_text(PageSlot.SET_UP)) == {"µ"}
     assert other.read_text(PageSlot.OUTCOME) == "OUTCOME: öffnen"
+    one.write_text(PageSlot.ERROR, "\udcff/e.yaml: no such file")  # of a name that is not UTF-8
+    assert other.read_text(PageSlot.ERROR) == r"\udcff/e.yaml: no such file"
 
 
 def test_events_come_once_and_are_cut_to_what_fits(sides):
