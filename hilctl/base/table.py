@@ -225,7 +225,8 @@ class ArrayTable(Table):
         check_rows(self.path, self._columns[0].size, first_row, last_row)
         rows = slice(first_row - 1, last_row)
         values = np.array([self._columns[each][rows] for each in columns], dtype=np.float64)
-        bad = np.argwhere(_invalid(values.T, columns, gaps))
+        missing = _missing(values)
+        bad = np.argwhere(missing.T & (np.array(columns) != gaps))
         if bad.size:
             row, column = bad[0]
             raise RowError(
@@ -234,14 +235,15 @@ class ArrayTable(Table):
                 first_row + int(row),
                 self._columns[0].size,
             )
-        values[~np.isfinite(values)] = np.nan
+        values[missing] = np.nan
         return TableRows(self.path, values, first_row + np.arange(values.shape[1]))
 
 
-def _invalid(values: F64, columns: Sequence[int], gaps: int | None) -> npt.NDArray[np.bool_]:
-    """Return which values of columns, float64[rows, columns], are neither finite nor missing."""
-    bad: npt.NDArray[np.bool_] = ~np.isfinite(values) & (np.array(columns) != gaps)
-    return bad
+def _missing(values: F64) -> npt.NDArray[np.bool_]:
+    """Return which values are not finite, or the marks of SCPI for an overload or no number."""
+    marks = (np.isclose(np.abs(values), each, rtol=1e-6, atol=0.0) for each in (9.9e37, 9.91e37))
+    missing: npt.NDArray[np.bool_] = np.logical_or.reduce((~np.isfinite(values), *marks))
+    return missing
 
 
 def check_rows(path: Path, count: int, first_row: int, last_row: int | None) -> None:
@@ -321,9 +323,14 @@ class TextTable(Table):
     def _is_data(self, cells: list[str], numeric: Sequence[int]) -> bool:
         chosen = [cells[each] for each in numeric] if len(cells) == self._count else []
         numbers = [_value(cell, self._comma) is not None for cell in chosen]
-        return any(numbers) and all(
-            is_number or _MISSING.fullmatch(cell)
-            for is_number, cell in zip(numbers, chosen, strict=True)
+        # Without a first cell it is a header of numbers above an index without a name.
+        return (
+            any(numbers)
+            and chosen[0] != ""
+            and all(
+                is_number or _MISSING.fullmatch(cell)
+                for is_number, cell in zip(numbers, chosen, strict=True)
+            )
         )
 
     def _is_footer(self, cells: list[str], numeric: Sequence[int]) -> bool:
@@ -360,7 +367,8 @@ class TextTable(Table):
         rows = self._rows[first_row - 1 : last_row]
         table = self._values(rows, columns, gaps, first_row)
         lines = np.array([number for number, _ in rows])
-        bad = np.argwhere(_invalid(table, columns, gaps))
+        missing = _missing(table)
+        bad = np.argwhere(missing & (np.array(columns) != gaps))
         if bad.size:
             row, column = bad[0]
             more = np.unique(bad[:, 0]).size - 1
@@ -368,7 +376,7 @@ class TextTable(Table):
             text += f"; so in {more} more rows" if more else ""
             place = self._place(lines[row], columns[column])
             raise RowError(f"{place}: {text}", first_row + int(row), len(self._rows))
-        table[~np.isfinite(table)] = np.nan
+        table[missing] = np.nan
         return TableRows(self.path, np.ascontiguousarray(table.T), lines)
 
     def _values(

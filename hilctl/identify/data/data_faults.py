@@ -6,7 +6,7 @@ import numpy as np
 
 from hilctl.base.types import F64
 from hilctl.identify.data.records import History, Record, SteadyLoop, turning_points
-from hilctl.identify.settings import FitSettings, IdentifySettings
+from hilctl.identify.settings import FitSettings
 
 AGAINST = -0.3  # correlation of command and displacement with the wrong sign
 LEADING = -0.02  # area of a loop, of its rectangle, whose displacement leads the command
@@ -60,15 +60,10 @@ def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[s
 
 def record_fault(record: Record, settings: FitSettings) -> str:
     """Return the fault of single samples or of a part of a record, and its cure; or empty."""
-    return (
-        _still(record, settings)
-        or _jump(record, settings)
-        or _clipped(record, settings)
-        or _far_from_zero(record, settings)
-    )
+    return _still(record) or _jump(record) or _clipped(record) or _far_from_zero(record, settings)
 
 
-def _jump(record: Record, settings: FitSettings) -> str:
+def _jump(record: Record) -> str:
     """Return a spike or a step: it differs from its neighbours by more than all others do."""
     y, u = record.displacement_um, record.command
     off = np.abs(y[1:-1] - 0.5 * (y[2:] + y[:-2]))
@@ -84,17 +79,17 @@ def _jump(record: Record, settings: FitSettings) -> str:
     if off[at - 1] <= least_um or size_um <= SPIKE_STROKE * others_um:
         return ""
     if not is_step:
-        in_table = isinstance(record, History) and _first_row(record, settings) is not None
+        in_table = isinstance(record, History) and record.rows.size
         cure = "remove the value (NaN or an empty cell)" if in_table else "measure again"
-        return f"has a spike of {y[at]:.4g} µm at {_place(record, settings, at)}: {cure}"
+        return f"has a spike of {y[at]:.4g} µm at {_place(record, at)}: {cure}"
     if abs(u[at + 1] - u[at - 1]) > JUMP * np.ptp(u):
         return ""
     at += abs(y[at + 1] - y[at]) > abs(y[at] - y[at - 1])  # the first sample after the step
-    cure = _without(record, settings, *((0, at) if at < y.size // 2 else (at, y.size)))
-    return f"has a step of {stays_um:.3g} µm at {_place(record, settings, at)}{cure}"
+    cure = _without(record, *((0, at) if at < y.size // 2 else (at, y.size)))
+    return f"has a step of {stays_um:.3g} µm at {_place(record, at)}{cure}"
 
 
-def _clipped(record: Record, settings: FitSettings) -> str:
+def _clipped(record: Record) -> str:
     y, u = record.displacement_um, record.command
     for end in (float(y.max()), float(y.min())):
         edges = np.flatnonzero(np.diff(np.concatenate(([False], y == end, [False]))))
@@ -104,13 +99,13 @@ def _clipped(record: Record, settings: FitSettings) -> str:
                 share = 100.0 * float(np.mean(y == end))
                 return (
                     f"stays at {end:.4g} µm for {share:.2g} % of its samples, first at "
-                    f"{_place(record, settings, start)}: the sensor is at the end of its range. "
+                    f"{_place(record, start)}: the sensor is at the end of its range. "
                     "Move the sensor, or lower the amplitude"
                 )
     return ""
 
 
-def _still(record: Record, settings: FitSettings) -> str:
+def _still(record: Record) -> str:
     """Return in which part of a history the displacement does not move and the command does."""
     if not isinstance(record, History):
         return ""
@@ -131,33 +126,24 @@ def _still(record: Record, settings: FitSettings) -> str:
     time_s = record.time_s
     return (
         f"hardly moves from {time_s[turns[first]]:.4g} to {time_s[turns[last]]:.4g} s: check coil, "
-        f"amplifier and sensor{_without(record, settings, start, stop)}"
+        f"amplifier and sensor{_without(record, start, stop)}"
     )
 
 
-def _place(record: Record, settings: FitSettings, at: int) -> str:
+def _place(record: Record, at: int) -> str:
     if not isinstance(record, History):
         return f"point {at + 1}"
-    row = _first_row(record, settings)
-    number = f"sample {at + 1}" if row is None else f"row {row + at}"
+    number = f"row {record.rows[at]}" if record.rows.size else f"sample {at + 1}"
     return f"{record.time_s[at]:.4g} s ({number})"
 
 
-def _without(record: Record, settings: FitSettings, start: int, stop: int) -> str:
+def _without(record: Record, start: int, stop: int) -> str:
     """Return how to identify without the samples from ``start`` to ``stop``."""
-    row = _first_row(record, settings)
-    if row is None:
+    if not (isinstance(record, History) and record.rows.size):
         return ", and measure again"
     if start > record.command.size - stop:
-        return f". Use the rows before it with --set table.last_row={row + start - 1}"
+        return f". Use the rows before it with --set table.last_row={record.rows[start] - 1}"
     return f". Use the rows after it with --set table.ignore={stop}"
-
-
-def _first_row(record: Record, settings: FitSettings) -> int | None:
-    """Return the row of the first sample; None if the record is not from a table."""
-    if not isinstance(settings, IdentifySettings) or record.label.endswith(".mcap"):
-        return None
-    return settings.table.first_row
 
 
 def _far_from_zero(record: Record, settings: FitSettings) -> str:

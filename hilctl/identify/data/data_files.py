@@ -67,7 +67,9 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
     _, displacement_um = _filled(path, row, found.values[0], found.values[1] * scale, every)
     # Not held, as in skipped ticks: the device moved on when the logger lost a row.
     command = np.interp(every, row, found.values[0] * command_scale)
-    history = History(path.name, command, displacement_um, rate_hz, settings.ignore, missing)
+    rows = settings.first_row + np.searchsorted(row, every)
+    signals = command, displacement_um
+    history = History(path.name, *signals, rate_hz, settings.ignore, missing, rows)
     if per_s == 1.0 and times:
         _check_rate(path, rate_hz)
     if scale == 1.0 and settings.displacement_scale is None:

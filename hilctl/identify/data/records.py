@@ -67,6 +67,8 @@ class History:
     ignore: int = 0  # samples at the start that are not evaluated
     held: I64 = field(default_factory=lambda: np.empty(0, np.int64))
     """Samples without a displacement; in those of skipped ticks the command was held."""
+    rows: I64 = field(default_factory=lambda: np.empty(0, np.int64))
+    """Row of each displacement in its table, from 1; empty if it is not from a table."""
 
     def __post_init__(self) -> None:
         check_signals(self.label, self.command, self.displacement_um)
@@ -92,6 +94,7 @@ class History:
             self,
             command=np.ascontiguousarray(self.command[: max(end, 0)]),
             displacement_um=np.ascontiguousarray(self.displacement_um[lag_samples:]),
+            rows=self.rows[lag_samples:],
         )
 
     def run(self) -> tuple[F64, F64, int]:

@@ -160,6 +160,7 @@ def test_numbers_keep_their_bits(table) -> None:
     ('"a, b",c\n1,2\n', ["a, b", "c"]),
     ("\ufeffa,b\n1,2\n", ["a", "b"]),
     (",x\n0,1\n", ["", "x"]),
+    (",0,1\n0,5.5,6.5\n1,5.5,6.5\n", ["", "0", "1"]),
     ("# a,b\n1,2\n", ["a", "b"]),
     ("# by hand\n# a,b\n1,2\n", ["a", "b"]),
     ("# by hand\n1,2\n", ["1", "2"]),
@@ -312,7 +313,8 @@ def test_gaps_of_one_column_are_accepted(table, tmp_path, cell):
 
 
 @pytest.mark.parametrize(
-    "mark", ["∞", "-∞", "inf", "OL", "Overload", "over range", "---", "1.#INF"]
+    "mark",
+    ["∞", "-∞", "inf", "OL", "Overload", "over range", "---", "1.#INF", "9.9E37", "-9.91e+37"],
 )
 @pytest.mark.parametrize("at", [0, 7, 19])
 def test_overload_marks_are_gaps_in_a_column_that_may_have_them(table, mark, at):

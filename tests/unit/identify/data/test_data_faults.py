@@ -7,20 +7,20 @@ import pytest
 
 from hilctl.identify.data.data_faults import record_fault
 from hilctl.identify.data.records import History
-from hilctl.identify.settings import IdentifySettings, TableSettings
+from hilctl.identify.settings import IdentifySettings
 from hilctl.models.plays import PpiModel
 
 TRUTH = PpiModel(direct=4.0, weights=(1.0, 2.0), thresholds=(2.0, 4.0))
 TIME_S = np.arange(4000) / 500.0
 COMMAND = 5.0 * np.sin(12.0 * TIME_S) * np.cos(0.2 * TIME_S)
 MOVES = TRUTH.forward(500.0).process(COMMAND)
+ROWS = 1 + np.arange(TIME_S.size)
 NOISE = 0.01 * np.random.default_rng(1).standard_normal(TIME_S.size)
 
 
-def fault(displacement_um, label="h.csv", **table):
-    settings = IdentifySettings(kind="ppi", table=TableSettings(**table))
-    history = History(label, COMMAND, displacement_um + NOISE, 500.0)
-    return record_fault(history, settings)
+def fault(displacement_um, rows=ROWS):
+    history = History("h", COMMAND, displacement_um + NOISE, 500.0, rows=rows)
+    return record_fault(history, IdentifySettings(kind="ppi"))
 
 
 def test_a_good_record_has_none():
@@ -44,8 +44,8 @@ def test_a_bad_part_is_named_and_skipped_by_the_option(displacement_um, said, cu
     kept = slice(int(value), None) if key == "ignore" else slice(0, int(value))
     rest = History("h.csv", COMMAND[kept], (displacement_um + NOISE)[kept], 500.0)
     assert record_fault(rest, IdentifySettings(kind="ppi")) == ""
-    assert "table." not in fault(displacement_um, label="run.mcap")
-    moved = fault(displacement_um, first_row=11)
+    assert "table." not in fault(displacement_um, rows=np.empty(0, int))
+    moved = fault(displacement_um, rows=10 + ROWS)
     if cure == "last_row":
         assert f"table.last_row={int(value) + 10}" in moved
 
@@ -68,7 +68,7 @@ def test_a_small_spike_is_named_with_a_cure_that_works():
     found = fault(displacement_um)
     assert "(row 778)" in found
     assert "NaN" in found
-    assert "NaN" not in fault(displacement_um, label="run.mcap")
+    assert "NaN" not in fault(displacement_um, rows=np.empty(0, int))
 
 
 def test_a_step_of_the_command_is_no_fault():

@@ -311,6 +311,9 @@ def test_missing_rows_are_interpolated_and_not_evaluated(tmp_path):
     np.testing.assert_allclose(history.displacement_um, 2.0 * np.arange(600))
     np.testing.assert_array_equal(history.held, [200, 201, 202, 500, 550])
     assert not history.evaluated()[[200, 203, 500, 550]].any()
+    assert history.rows[[0, 199, 203, 499, 599]].tolist() == [1, 200, 201, 497, 596]
+    late = read_table(tmp_path / "t.csv", TableSettings(first_row=101)).history.without_lag(2)
+    assert late.rows[[0, 400]].tolist() == [103, 499]
 
 
 def test_more_missing_rows_are_refused_with_the_first(tmp_path):
