@@ -312,7 +312,7 @@ class LiveServer:
         refused = refusal(request.headers, self._token, upgrade=upgrade)
         if refused is None and upgrade and len(self._viewers) >= _MOST_VIEWERS:
             refused = (HTTPStatus.SERVICE_UNAVAILABLE, "too many pages are connected")
-        if request.method != "GET":
+        if getattr(request, "method", "GET") != "GET":  # before 17.0, websockets refuses others
             refused = (HTTPStatus.METHOD_NOT_ALLOWED, "only GET is served")
         if refused is not None:
             return plain_response(*refused)

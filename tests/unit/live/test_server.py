@@ -9,6 +9,7 @@ import socket
 import subprocess
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
+from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -201,6 +202,16 @@ def test_only_get_requests_of_files_are_served():
             return [(await http(server, line))[0] for line in lines]
 
     assert asyncio.run(answers()) == [200, 200, 403, 405, 405, 404]
+
+
+def test_requests_without_a_method_are_of_an_older_websockets_and_get():
+    server = LiveServer(first)
+    request = SimpleNamespace(path="/", headers=Headers(Host=f"127.0.0.1:{server.port}"))
+    try:
+        assert server._admit(Mock(), request).status_code == 200
+    finally:
+        for each in server._sockets:
+            each.close()
 
 
 def test_a_message_that_is_too_long_ends_its_connection_only():
