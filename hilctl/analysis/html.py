@@ -9,14 +9,12 @@ import html
 import io
 import re
 from collections.abc import Iterable, Sequence
-from pathlib import Path
 
 import matplotlib as mpl
 from matplotlib.figure import Figure
 
 from hilctl.analysis.figure_layout import UNDATED_SVG, FigureSpec, drawn
 from hilctl.analysis.plot_style import STYLE
-from hilctl.base.files import write_text
 from hilctl.base.formatting import MISSING, printable
 
 _METADATA = re.compile(r"<metadata>.*?</metadata>", re.DOTALL)
@@ -89,11 +87,6 @@ _HEAD = """<!DOCTYPE html>
 <meta name="viewport" content="width=device-width, initial-scale=1">
 <title>{title}</title><style>{css}</style></head><body><main>
 <h1>{title}</h1>"""
-
-
-def write_page(page: str, path: Path) -> None:
-    """Write a page, also over an existing file; raise InputError if it cannot be written."""
-    write_text(path, page, overwrite=True)
 
 
 def document(title: str, body: Iterable[str]) -> str:

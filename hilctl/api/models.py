@@ -263,10 +263,9 @@ def compare(
         progress=on_progress,
     )
     if html is not None:
-        from hilctl.analysis.html import write_page  # it imports matplotlib
-        from hilctl.comparison.comparison_page import comparison_page
+        from hilctl.comparison.comparison_page import comparison_page  # it imports matplotlib
 
-        write_page(comparison_page(comparison), Path(html))
+        write_text(Path(html), comparison_page(comparison), overwrite=True)
     if save is not None:
         created = datetime.now(UTC).isoformat(timespec="seconds")
         library.save_models(comparison, Path(save), created=created, overwrite=overwrite)

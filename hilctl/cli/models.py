@@ -11,7 +11,7 @@ from rich.table import Table
 
 from hilctl import api
 from hilctl.base.errors import InputError
-from hilctl.base.files import check_writable
+from hilctl.base.files import check_writable, write_text
 from hilctl.cli.console import listing, print_rich, progress_bar, table
 from hilctl.cli.options import (
     AsJson,
@@ -192,10 +192,9 @@ def identify(
             on_progress=progress,
         )
     if html is not None:
-        from hilctl.analysis.html import write_page  # it imports matplotlib
-        from hilctl.identify.model_page import identification_page
+        from hilctl.identify.model_page import identification_page  # it imports matplotlib
 
-        write_page(identification_page(result), html)
+        write_text(html, identification_page(result), overwrite=True)
     refused = result.verdict.grade == "not a model"
     values = {"output": str(output) if output and not refused else None, **result.to_mapping()}
     print_result(values, lambda: print_identification(result, output), as_json=as_json)
@@ -238,10 +237,9 @@ def refine(
             on_progress=progress,
         )
     if html is not None:
-        from hilctl.analysis.html import write_page  # it imports matplotlib
-        from hilctl.identify.model_page import refinement_page
+        from hilctl.identify.model_page import refinement_page  # it imports matplotlib
 
-        write_page(refinement_page(result), html)
+        write_text(html, refinement_page(result), overwrite=True)
     written = str(output) if output and result.better else None
     values = {"output": written, **result.to_mapping()}
     print_result(values, lambda: print_refinement(result, output), as_json=as_json)

@@ -19,6 +19,7 @@ from hilctl.analysis.plot_style import (
     plain_numbers,
 )
 from hilctl.analysis.response.frequency_response import FrequencyResponse
+from hilctl.base.files import write_text
 from hilctl.base.formatting import MISSING, quantity, significant, unit_text
 
 _MOST_ROWS = 24
@@ -162,4 +163,4 @@ def write_responses(responses: Sequence[FrequencyResponse], path: Path) -> None:
         *html.results([response_sheet(responses, names)], "Fit", list(tables), lines),
         html.definitions("coherence", "lines not excited"),
     ]
-    html.write_page(html.document("Frequency response", body), path)
+    write_text(path, html.document("Frequency response", body), overwrite=True)

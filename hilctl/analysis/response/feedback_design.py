@@ -19,6 +19,7 @@ from hilctl.analysis.figure_layout import FigureSpec, Panel
 from hilctl.analysis.plot_style import DISPLACEMENT, MARK, REFERENCE, plain_numbers
 from hilctl.analysis.response.frequency_response import measured_lines
 from hilctl.base.errors import DataError, InputError
+from hilctl.base.files import write_text
 from hilctl.base.formatting import quantity, shown_briefly
 from hilctl.base.yaml import Document, commented
 from hilctl.experiment.closed_loop import (
@@ -215,4 +216,4 @@ def write_design(design: FeedbackDesign, path: Path) -> None:
         html.paragraph(str(design.path), "file"),
         *html.results([open_loop_sheet(design)], "Margins", tables, [section]),
     ]
-    html.write_page(html.document("Feedback", body), path)
+    write_text(path, html.document("Feedback", body), overwrite=True)

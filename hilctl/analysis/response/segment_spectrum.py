@@ -15,6 +15,7 @@ from hilctl.analysis.figure_layout import FigureSpec, Panel
 from hilctl.analysis.plot_style import NAMED, plain_numbers
 from hilctl.analysis.steady_state import steady_samples
 from hilctl.base.errors import DataError
+from hilctl.base.files import write_text
 from hilctl.base.formatting import quantity, shown_briefly
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
@@ -283,4 +284,4 @@ def write_spectra(found: Sequence[SegmentSpectrum], path: Path) -> None:
         *html.results(spectrum_sheets(found), "Results", list(tables)),
         html.definitions(*terms),
     ]
-    html.write_page(html.document("Spectrum", body), path)
+    write_text(path, html.document("Spectrum", body), overwrite=True)

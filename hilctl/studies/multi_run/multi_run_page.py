@@ -6,6 +6,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl.analysis import html
+from hilctl.base.files import write_text
 from hilctl.base.formatting import finite, quantity
 from hilctl.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.studies.multi_run.plots import sheets_of
@@ -33,7 +34,7 @@ _COLUMNS = (*_SHORT_COLUMNS[:4], RMS_ERROR, MODEL_ERROR, NATURAL, DAMPING)
 
 def write_series(series: RunSeries, path: Path) -> None:
     """Write the page atomically, replacing an existing file."""
-    html.write_page(series_page(series), path)
+    write_text(path, series_page(series), overwrite=True)
 
 
 def series_page(series: RunSeries) -> str:
