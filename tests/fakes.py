@@ -21,6 +21,7 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.loop.block import Block
 from hilctl.loop.interlocks import AuxLimit, InterlockContext, Interlocks, InterlockSettings
+from hilctl.run.run_folder import DeviceLocks
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
@@ -527,3 +528,11 @@ class FailingFile(io.FileIO):
         if len(data) and fits <= 0:
             raise OSError(errno.ENOSPC, os.strerror(errno.ENOSPC))
         return super().write(data[:fits])
+
+
+@contextmanager
+def held_devices(holds, **options):
+    """Hold a device, as a run does."""
+    with DeviceLocks(holds, **options) as locks:
+        locks.acquire()
+        yield

@@ -6,7 +6,7 @@ from pathlib import Path
 
 from hilctl.base.device import Device, DeviceInfo, DeviceReadings, ReadableDevice
 from hilctl.experiment.load import LoadedExperiment, load_experiment
-from hilctl.run.run_folder import held_devices
+from hilctl.run.run_folder import DeviceLocks
 
 _ABSURD = 100.0  # A value this many ranges outside is not a signal: its bytes are decoded wrongly
 _TINY = 1e-18  # A value this close to 0, relative to the range, is decoded wrongly as well
@@ -35,7 +35,8 @@ def probe(path: Path, settings: list[str]) -> Probed:
     # Reading sends no set-up steps, and a tripped watchdog stays tripped.
     loaded = load_experiment(path, settings)
     info = loaded.device.info
-    with held_devices(info.holds):
+    with DeviceLocks(info.holds) as locks:
+        locks.acquire()
         displacement_um, output, measured, tripped = _read(loaded, loaded.device)
     return Probed(
         name=info.name,

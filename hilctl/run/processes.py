@@ -2,7 +2,6 @@
 
 import logging
 import os
-import select
 import signal
 import subprocess
 import time
@@ -159,9 +158,7 @@ class GuardianProcess(ChildProcess):
 
     @property
     def error(self) -> str:
-        """Why it does not act."""
-        if not self.ended and self.phase != GuardianPhase.FAILED:
-            return "it does not start"
+        """Why it ended."""
         if self.phase == GuardianPhase.FAILED:
             return self._page.read_text(PageSlot.GUARDIAN)
         with suppress(OSError):
@@ -199,11 +196,8 @@ class GuardianRelief:
                 with suppress(OSError, ValueError):  # it has just ended
                     if not (page := SampleRing(run.ring).page).is_settled():
                         self._pages.append((run, page))
-
-    @property
-    def found(self) -> bool:
+        self.found = bool(self._pages)
         """Whether there are earlier runs whose output is not safe."""
-        return bool(self._pages)
 
     @property
     def runs(self) -> list[RunFolder]:
@@ -248,7 +242,7 @@ class GuardianRelief:
                     _log.error(text, run.card.name, error.strerror)
 
 
-def signal_guardian(run: RunFolder, number: int, wait_s: float = 0.0) -> bool:
+def signal_guardian(run: RunFolder, number: int) -> bool:
     """Send a signal to the guardian of a run; return whether there was one."""
     try:
         guardian = os.pidfd_open(
@@ -261,7 +255,6 @@ def signal_guardian(run: RunFolder, number: int, wait_s: float = 0.0) -> bool:
         if not run.alive:
             return False
         signal.pidfd_send_signal(guardian, number)
-        select.select([guardian], [], [], wait_s)
     except ProcessLookupError:
         return False
     finally:

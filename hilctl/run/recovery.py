@@ -19,7 +19,7 @@ from hilctl.recording.recover import recover_recording
 from hilctl.run.metadata import end_facts
 from hilctl.run.run_folder import RunFolder, runs, taken_over
 from hilctl.run.shared.ring import SampleRing, safe_result_of
-from hilctl.run.shared.shared_page import PageField, PageSlot, Phase
+from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, SharedPage
 
 _RESULT_S = 1.0
 _POLL_S = 0.02
@@ -74,19 +74,23 @@ def _finish(run: RunFolder, recovered: RecoveredRun) -> None:
         run.remove()
         return
     run.keep(recorded=True)
-    with suppress(OSError, ValueError):
-        # Last: its guardian removes the folder from now on.
-        SampleRing(run.ring).page.put(PageField.RECORDED, 1)
+    if (page := _page(run)) is not None:
+        page.put(PageField.RECORDED, 1)  # last: its guardian removes the folder from now on
     if not run.alive and _is_settled(run):
         run.remove()
 
 
+def _page(run: RunFolder) -> SharedPage | None:
+    """Return the page of a run; None if its ring is missing or damaged."""
+    with suppress(OSError, ValueError):
+        return SampleRing(run.ring).page
+    return None
+
+
 def _is_settled(run: RunFolder) -> bool:
     """Return whether the output of a dead run needs no more attention."""
-    try:
-        return SampleRing(run.ring, look_only=True).page.is_settled()
-    except (OSError, ValueError):
-        return True
+    page = _page(run)
+    return page is None or page.is_settled()
 
 
 def _recover(run: RunFolder) -> RecoveredRun:
@@ -96,7 +100,8 @@ def _recover(run: RunFolder) -> RecoveredRun:
         return RecoveredRun(run.card.name, path, True, "nothing has moved", started=False)
     outcome, batches, events, end = _left_behind(run)
     where = "at its safe value" if outcome.safe else "NOT confirmed to be safe: check it"
-    if _is_recorded(run):
+    page = _page(run)
+    if page is not None and page.get(PageField.RECORDED):
         return RecoveredRun(run.card.name, path, outcome.safe, f"{outcome.reason}; output {where}")
     try:
         recovered = recover_recording(path, batches, end, events=events, ended_at=outcome.ended_at)
@@ -109,18 +114,9 @@ def _recover(run: RunFolder) -> RecoveredRun:
     return RecoveredRun(run.card.name, path, outcome.safe, text)
 
 
-def _is_recorded(run: RunFolder) -> bool:
-    """Return whether the supervisor had closed the recording."""
-    try:
-        return bool(SampleRing(run.ring).page.get(PageField.RECORDED))
-    except (OSError, ValueError):
-        return False
-
-
 def _has_started(run: RunFolder, recording: Path) -> bool:
-    try:
-        page = SampleRing(run.ring).page
-    except (OSError, ValueError):  # the ring is created before the recording is written
+    page = _page(run)
+    if page is None:  # the ring is created before the recording is written
         return not (recording.is_file() and recording.stat().st_size == 0)
     return bool(page.get(PageField.GO) or page.get(PageField.SENT))
 

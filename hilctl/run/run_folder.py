@@ -408,14 +408,6 @@ class DeviceLocks:
         self.close()
 
 
-@contextmanager
-def held_devices(holds: Sequence[str]) -> Iterator[None]:
-    """Lock a device's resources, see :meth:`DeviceLocks.acquire`."""
-    with DeviceLocks(holds) as locks:
-        locks.acquire()
-        yield
-
-
 def _digest(name: str) -> str:
     return hashlib.sha256(os.fsencode(name)).hexdigest()
 

@@ -161,11 +161,6 @@ class RunMonitor:
             self._conclude(ended=ended)
         return not self._recording.finished
 
-    @property
-    def unsafe(self) -> bool:
-        """Whether the output is not known to be safe, although the device could confirm it."""
-        return self.outcome is None or self.outcome.output in {"set", "unknown"}
-
     def break_off(self, error: Exception) -> None:
         """Stop the loop by its safe ramp because the supervisor failed."""
         self.broke = self.broke or f"{type(error).__name__}: {error}"
@@ -315,11 +310,13 @@ class Supervisor:
             ring.page.put(PageField.RECORDED, int(not recorder.error))
             stops = self._stops
             guarded = safety.close(lambda: self._stops > stops)
-            unsafe = bool(holds) and started.unsafe
+            outcome = started.outcome
+            assert outcome is not None
+            unsafe = bool(holds) and outcome.output in {"set", "unknown"}
             if guarded or unsafe or recorder.error:
                 # For its guardian, the next command, or samples that are only in the ring.
                 folder.keep(recorded=not recorder.error)
-            return self._result(started, recorder, ring, folder, guarded=guarded)
+            return self._result(outcome, started.broke, recorder, ring, folder, guarded=guarded)
 
     def _start(
         self,
@@ -475,15 +472,14 @@ class Supervisor:
 
     def _result(
         self,
-        started: RunMonitor,
+        outcome: LoopOutcome,
+        broken: str,
         recorder: Recorder,
         ring: SampleRing,
         folder: RunFolder,
         *,
         guarded: bool,
     ) -> RunResult:
-        outcome = started.outcome
-        assert outcome is not None
         requested = self._stop_signal == STOP_SIGNAL
         stop_signal = signal.SIGTERM if requested else self._stop_signal
         cut = ""
@@ -491,9 +487,9 @@ class Supervisor:
             cut = f"; {recorder.missing} samples are not in the recording: {recorder.error}; "
             cut += f"those in memory are kept in {folder.path}: any hilctl command adds them when "
             cut += "the file can be written"
-        broke = f"; the supervisor broke: {started.broke}" if started.broke else ""
+        broke = f"; the supervisor broke: {broken}" if broken else ""
         unasked = outcome.code == "stopped" and not stop_signal
-        fault = recorder.error or started.broke or unasked
+        fault = recorder.error or broken or unasked
         code = "fault" if fault else outcome.code
         skipped = ring.page.lateness().skipped_ticks
         due = (recorder.samples + recorder.missing) // self._config.block

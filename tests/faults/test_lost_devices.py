@@ -100,7 +100,9 @@ def test_safe_by_hand_relieves_the_guardian_and_gives_back_what_it_cannot_do(aba
 def test_safe_by_hand_starts_a_dead_guardian_again(abandoned):
     """Which ``hilctl status`` lists, and ``hilctl stop`` ends."""
     (run,) = runs()
-    assert signal_guardian(run, signal.SIGKILL, 10.0)
+    assert signal_guardian(run, signal.SIGKILL)
+    while run.alive:
+        time.sleep(0.01)
     assert [(run["state"], run["output_state"]) for run in active()] == [("dead", "unknown")]
     found = said("safe", abandoned.experiment, code=3)
     assert (found["output_state"], found["guardian_active"]) == ("unknown", True)

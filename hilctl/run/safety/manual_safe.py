@@ -74,12 +74,11 @@ def put_safe(
     if device is None:
         raise ConfigError([ConfigProblem(str(path), "device", "is required, with a key kind")])
     info = device.info
-    died, relief = _earlier_runs(info.holds)
-    goal = SafeGoal(safe.value, 1.0, None, pending=died)
-    output = SafeOutput(device, goal, clock, relief.note_write)
     with ExitStack() as stack:
         # Refused while a run holds the device: its loop would overwrite the safe value.
-        _acquire(stack, info.holds, relief)
+        died, relief = _taken_over(stack, info.holds)
+        goal = SafeGoal(safe.value, 1.0, None, pending=died)
+        output = SafeOutput(device, goal, clock, relief.note_write)
         stack.callback(_close, device)
         _drive(output, clock, sleep)
         if output.final:
@@ -96,26 +95,21 @@ def put_safe(
     )
 
 
-def _earlier_runs(holds: Sequence[str]) -> tuple[bool, GuardianRelief]:
-    """Return whether a run of the device died, and the relief of guardians.
+def _taken_over(stack: ExitStack, holds: Sequence[str]) -> tuple[bool, GuardianRelief]:
+    """Take a device over until the end of a stack, without locks if they cannot be created.
 
-    A dead run may have left an unanswered command.
+    Return whether a run of it died, which may have left an unanswered command, and the relief of
+    its guardian.
     """
+    died, relief = True, GuardianRelief(())
     try:
         relief = GuardianRelief(holds)
-        return relief.found, relief
-    except RunError as error:
-        _log.warning("%s: the safe value is written anyway", error)
-        return True, GuardianRelief(())
-
-
-def _acquire(stack: ExitStack, holds: Sequence[str], relief: GuardianRelief) -> None:
-    """Acquire the locks of a device until the end of a stack, or none if they cannot be created."""
-    try:
+        died = relief.found
         # Another user must not prevent the safe value.
         relief.acquire(stack.enter_context(DeviceLocks(holds, take_over=True)))
     except RunError as error:  # such as a full /dev/shm: the output must become safe nevertheless
         _log.warning("%s: the safe value is written anyway", error)
+    return died, relief
 
 
 def _close(device: Device) -> None:

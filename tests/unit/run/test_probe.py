@@ -14,11 +14,10 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.yaml import dump
 from hilctl.experiment.devices import device_class
 from hilctl.run.probe import judge, probe
-from hilctl.run.run_folder import held_devices
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.simulated.devices import TerfenolOptions
-from tests.fakes import ManualClock, emulated, logged
+from tests.fakes import ManualClock, emulated, held_devices, logged
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 INFO = DeviceInfo(

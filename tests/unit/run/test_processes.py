@@ -13,9 +13,10 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run import processes as module
 from hilctl.run.processes import GuardianRelief, LoopProcess
-from hilctl.run.run_folder import DeviceLocks, held_devices, run_folder, runs
+from hilctl.run.run_folder import DeviceLocks, run_folder, runs
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase
+from tests.fakes import held_devices
 
 HOLDS = f"tcp:10.9.8.7:{os.getpid()}"  # locks are the whole machine's
 

@@ -18,7 +18,6 @@ from hilctl.run.run_folder import (
     GUARDIAN,
     DeviceLocks,
     base_folder,
-    held_devices,
     keep_removed,
     require_linux,
     run_folder,
@@ -26,6 +25,7 @@ from hilctl.run.run_folder import (
     taken_over,
 )
 from hilctl.run.start import checked_experiment, start_detached, start_run
+from tests.fakes import held_devices
 
 
 @pytest.fixture(autouse=True)

@@ -9,6 +9,7 @@ import signal
 import socket
 import threading
 from contextlib import contextmanager
+from dataclasses import replace
 from types import SimpleNamespace
 from unittest.mock import Mock
 
@@ -20,11 +21,11 @@ from hilctl.loop.pacer import Lateness
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run import supervisor as module
 from hilctl.run.control.client import STOP_SIGNAL
-from hilctl.run.run_folder import held_devices, run_folder, runs
+from hilctl.run.run_folder import run_folder, runs
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot, SafeActionResult, Stop
 from hilctl.run.supervisor import ProgressThread, RunMonitor, Supervisor, SystemdNotifier
-from tests.fakes import SteppingClock
+from tests.fakes import SteppingClock, held_devices
 
 MS = 1_000_000
 HOLDS = f"tcp:10.9.8.7:{os.getpid()}"  # locks are the whole machine's
@@ -79,7 +80,7 @@ class Neighbours:
             begin=self.begin, discard=lambda: self.open.remove("recorder"),
         )  # fmt: skip
         self.outcome = LoopOutcome("completed", "waveform completed", 100, "confirmed", 0)
-        self.broke, self.unsafe = "", False
+        self.broke = ""
         for name, double in {
             "time": self.time,
             "be_ordinary": lambda: None,
@@ -184,7 +185,6 @@ class Neighbours:
             progress_failed=None,
             break_off=lambda error: self.broken_off.append(str(error)),
             outcome=self.outcome,
-            unsafe=self.unsafe,
             broke=self.broke,
         )
 
@@ -422,7 +422,8 @@ def test_how_it_ended(stage, changes, code, reason):
 def test_the_folder_is_kept_for_samples_that_the_file_lacks_or_an_unsafe_output(
     stage, error, guarded, unsafe
 ):
-    stage.recorder.error, stage.guarded, stage.unsafe = error, guarded, unsafe
+    stage.recorder.error, stage.guarded = error, guarded
+    stage.outcome = replace(stage.outcome, output="unknown" if unsafe else "confirmed")
     result = stage.run()
     (left,) = runs()
     assert (left.alive, left.recorded) == (False, not error)
@@ -433,7 +434,8 @@ def test_the_folder_is_kept_for_samples_that_the_file_lacks_or_an_unsafe_output(
 
 
 def test_a_simulated_device_needs_no_attention_after_its_run(stage):
-    stage.info.simulated, stage.info.holds, stage.unsafe = True, (), True
+    stage.info.simulated, stage.info.holds = True, ()
+    stage.outcome = replace(stage.outcome, output="unknown")
     stage.run()
     assert runs() == []
 

@@ -7,9 +7,9 @@ import pytest
 import yaml
 
 from hilctl.base.errors import ConfigError, DeviceError, InputError, UnconfirmedError
-from hilctl.run.run_folder import held_devices
 from hilctl.run.safety.manual_safe import put_safe
 from hilctl_drivers.simulated.devices import SimulatedTerfenol
+from tests.fakes import held_devices
 
 
 class Amplifier(SimulatedTerfenol):
