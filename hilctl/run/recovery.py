@@ -47,7 +47,7 @@ def recover_dead_runs() -> list[RecoveredRun]:
     for run in runs():
         if run.recorded and not run.alive and _is_settled(run):
             run.remove()
-        if run.recorded or run.supervised or run.loops:
+        if run.recorded or run.supervised or (run.alive and run.loops):
             continue
         _await_guardian(run)
         with taken_over(run) as ours, _undisturbed():

@@ -131,14 +131,15 @@ def test_a_recording_is_completed_while_the_guardian_acts(dead):
 
 
 def test_a_recording_is_left_to_a_loop_that_still_ramps(dead, monkeypatch):
-    loops = [True]
+    loops, held = [True], []
     monkeypatch.setattr(RunFolder, "loops", property(lambda run: loops[0]))
-    recording = dead(watching, holds=HOLDS)
+    recording = dead(watching, holds=HOLDS, guardian=held)
     before = recording.read_bytes()
     assert recover_dead_runs() == []
     assert recording.read_bytes() == before
     loops[0] = False
     assert len(recover_dead_runs()) == 1
+    os.close(held.pop())
 
 
 @pytest.fixture
