@@ -204,7 +204,7 @@ def _await_loop(run: AttackedRun, page: SharedPage, loop: int) -> None:
         try:
             if b") Z" in Path(f"/proc/{loop}/stat").read_bytes():
                 return
-        except FileNotFoundError:
+        except (FileNotFoundError, ProcessLookupError):
             return
         time.sleep(0.01)
 
