@@ -172,6 +172,7 @@ def attack(
     os.kill(run.emulator.pid, signal.SIGCONT)
     return_ns = time.monotonic_ns()
     said += _await_end(run, page)
+    run.recover()  # of a loop that was stopped until now
     ends = "loop" in plan or plan.get("supervisor") == "kill" or phase in {"ramp out", "close"}
     due_ns = hit_ns if ends else stop_ns
     if phase == "away" or len(plan) == len(processes):  # or until one of them is continued
