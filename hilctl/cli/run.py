@@ -231,7 +231,7 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
     if not result.safe:
         terminal.print(f"Not safe: {describe(result.output_state)}.", style="bold red")
     if result.guardian_active:
-        terminal.print("The guardian is still retrying: see hilctl status; hilctl safe ends it.")
+        terminal.print("The guardian is still retrying: see hilctl status and hilctl stop --run.")
     if result.deadline_misses:
         terminal.print(result.deadline_misses, style="bold yellow")
     if result.samples == 0:
