@@ -15,9 +15,9 @@ from matplotlib.colors import PowerNorm
 from matplotlib.figure import Figure
 
 from hilctl import api
-from hilctl.analysis.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, STYLE
 from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import stop_step
+from hilctl.lab.pages.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, STYLE
 from hilctl.models.base import HysteresisModel
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel

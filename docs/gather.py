@@ -13,8 +13,8 @@ from pathlib import Path
 from typing import Any
 
 from hilctl import api
-from hilctl.analysis.html import DEFINITIONS
 from hilctl.cli.commands import COMMANDS, load
+from hilctl.lab.pages.html import DEFINITIONS
 
 ROOT = Path(__file__).parents[1]
 DOCUMENTS = {

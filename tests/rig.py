@@ -2,8 +2,8 @@
 
 import numpy as np
 
-from hilctl.identify.data.cycles import average_cycle
-from hilctl.identify.data.records import SteadyLoop
+from hilctl.lab.identify.data.cycles import average_cycle
+from hilctl.lab.identify.data.records import SteadyLoop
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 
 RATE_HZ = 50_000.0

@@ -4,13 +4,13 @@ from typing import Any
 
 import numpy as np
 
-from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.fit_api import FitRequest
-from hilctl.identify.fit_data import FitData
-from hilctl.identify.fit_model import FittedModel, fit_model
-from hilctl.identify.settings import FitSettings
-from hilctl.identify.staged.objective import Layers, Point
-from hilctl.identify.staged.staged_fits import convex_start
+from hilctl.lab.identify.data.records import SteadyLoop
+from hilctl.lab.identify.fit_api import FitRequest
+from hilctl.lab.identify.fit_data import FitData
+from hilctl.lab.identify.fit_model import FittedModel, fit_model
+from hilctl.lab.identify.settings import FitSettings
+from hilctl.lab.identify.staged.objective import Layers, Point
+from hilctl.lab.identify.staged.staged_fits import convex_start
 from hilctl.models.integrated import exponential_integrated
 from hilctl.models.staged import StagedModel
 

@@ -1,8 +1,7 @@
-"""Metrics, reports, replays, plots, pages, exports and the catalogue of recordings."""
+"""Metrics, reports, replays, exports and the catalogue of recordings."""
 
 PUBLIC = (
-    "catalogue", "decimation", "export", "figure_layout", "html", "plot_style", "replay", "report",
-    "run_metrics", "response.bode", "response.feedback_design", "response.frequency_response",
-    "response.segment_spectrum", "response.step_response", "run_page", "steady_state",
+    "catalogue", "export", "replay", "report", "run_metrics", "steady_state",
+    "tick_lateness",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -40,7 +40,7 @@ class SteadyPart:
 
 @dataclass(frozen=True, slots=True)
 class Overview(Recording):
-    """Decimated recording for plots, see :mod:`hilctl.analysis.decimation`.
+    """Decimated recording for plots, see :mod:`hilctl.lab.run_report.decimation`.
 
     Evaluated samples of each segment (first, after the last, whole cycles), and its steady part,
     which was computed from all samples but has only the last ones.

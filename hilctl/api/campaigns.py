@@ -11,11 +11,8 @@ from hilctl.base.files import check_no_input, check_writable, is_folder, write_t
 from hilctl.base.table import Column
 from hilctl.experiment.correction import write_correction
 from hilctl.experiment.load import inputs_of
-from hilctl.ilc.ilc_session import IlcResult, IlcRow, IlcSession
-from hilctl.recording.run_summary import recordings_in
-from hilctl.run.control.client import finish_dead_runs
-from hilctl.run.start import paced, unpaced, unused
-from hilctl.studies.calibrate import (
+from hilctl.lab.ilc.ilc_session import IlcResult, IlcRow, IlcSession
+from hilctl.lab.studies.calibrate import (
     CalibrationFit,
     Origin,
     existing_calibration,
@@ -24,7 +21,7 @@ from hilctl.studies.calibrate import (
     sensor_points,
     write_calibration,
 )
-from hilctl.studies.campaign.campaign_runner import (
+from hilctl.lab.studies.campaign.campaign_runner import (
     CampaignResult,
     planned_fast,
     planned_in_real_time,
@@ -32,16 +29,19 @@ from hilctl.studies.campaign.campaign_runner import (
     run_fast,
     run_series,
 )
-from hilctl.studies.campaign.plan import CampaignPlan
-from hilctl.studies.campaign.steps import CampaignStep, CampaignSteps, load_campaign
-from hilctl.studies.campaign.store import CampaignRow, campaign_folder
-from hilctl.studies.characterise.characterisation_runner import (
+from hilctl.lab.studies.campaign.plan import CampaignPlan
+from hilctl.lab.studies.campaign.steps import CampaignStep, CampaignSteps, load_campaign
+from hilctl.lab.studies.campaign.store import CampaignRow, campaign_folder
+from hilctl.lab.studies.characterise.characterisation_runner import (
     CharacterisationPlan,
     CharacterisationRunner,
 )
-from hilctl.studies.characterise.results import Characterisation, StepRow
-from hilctl.studies.characterise.rig_page import characterisation_page
-from hilctl.studies.step_runner import StudyHost
+from hilctl.lab.studies.characterise.results import Characterisation, StepRow
+from hilctl.lab.studies.characterise.rig_page import characterisation_page
+from hilctl.lab.studies.step_runner import StudyHost
+from hilctl.recording.run_summary import recordings_in
+from hilctl.run.control.client import finish_dead_runs
+from hilctl.run.start import paced, unpaced, unused
 
 
 def _nothing(*_ignored: object) -> None:

@@ -11,16 +11,16 @@ from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import CommandUnit
-from hilctl.comparison import compare as library
-from hilctl.comparison.compare import Comparison
 from hilctl.experiment.load import inputs_of
-from hilctl.identify.data.data_files import load_records
-from hilctl.identify.fit_api import FitRequest
-from hilctl.identify.model_selection import choose_lag
-from hilctl.identify.parallel import workers
-from hilctl.identify.pipeline import Identification, identify_records, settings_from
-from hilctl.identify.refine.acceptance import TOLERANCE_PERCENT
-from hilctl.identify.refine.refinement import Refinement, load_runs, refine_runs
+from hilctl.lab.comparison import compare as library
+from hilctl.lab.comparison.compare import Comparison
+from hilctl.lab.identify.data.data_files import load_records
+from hilctl.lab.identify.fit_api import FitRequest
+from hilctl.lab.identify.model_selection import choose_lag
+from hilctl.lab.identify.parallel import workers
+from hilctl.lab.identify.pipeline import Identification, identify_records, settings_from
+from hilctl.lab.identify.refine.acceptance import TOLERANCE_PERCENT
+from hilctl.lab.identify.refine.refinement import Refinement, load_runs, refine_runs
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator
 from hilctl.models.model_export import check_rate, export_text
 from hilctl.models.model_file import dump_model
@@ -263,7 +263,7 @@ def compare(
         progress=on_progress,
     )
     if html is not None:
-        from hilctl.comparison.comparison_page import comparison_page  # it imports matplotlib
+        from hilctl.lab.comparison.comparison_page import comparison_page  # it imports matplotlib
 
         write_text(Path(html), comparison_page(comparison), overwrite=True)
     if save is not None:

@@ -6,19 +6,19 @@ from typing import Literal
 
 from matplotlib.axes import Axes
 
-from hilctl.analysis.decimation import overview
-from hilctl.analysis.figure_layout import FigureSpec, formats_of
 from hilctl.analysis.run_metrics import RunReport
-from hilctl.analysis.run_page import page, run_sheets
 from hilctl.api._types import PathLike, Paths, paths_of
 from hilctl.api.recordings import stream_of
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, is_folder, write_text
+from hilctl.lab.pages.figure_layout import FigureSpec, formats_of
+from hilctl.lab.run_report.decimation import overview
+from hilctl.lab.run_report.run_page import page, run_sheets
+from hilctl.lab.studies.multi_run.collect import RunSeries, collect
+from hilctl.lab.studies.multi_run.multi_run_page import write_series
+from hilctl.lab.studies.multi_run.plots import applying_sheets, draw_sheets, write_sheets
 from hilctl.models.model_file import load_model
 from hilctl.run.control.client import finish_dead_runs
-from hilctl.studies.multi_run.collect import RunSeries, collect
-from hilctl.studies.multi_run.multi_run_page import write_series
-from hilctl.studies.multi_run.plots import applying_sheets, draw_sheets, write_sheets
 
 
 def report_page(

@@ -5,25 +5,25 @@ from itertools import chain
 from pathlib import Path
 from typing import TypeVar
 
-from hilctl.analysis.response.bode import write_responses
-from hilctl.analysis.response.feedback_design import (
-    FeedbackDesign,
-    design_feedback,
-    write_design,
-)
-from hilctl.analysis.response.frequency_response import (
-    FrequencyResponse,
-    Signals,
-    frequency_response,
-)
-from hilctl.analysis.response.segment_spectrum import SegmentSpectrum, spectra, write_spectra
-from hilctl.analysis.response.step_response import SETTLED_PERCENT, StepResponse
-from hilctl.analysis.response.step_response import step_response as measured_step
 from hilctl.api._types import PathLike, Paths, paths_of
 from hilctl.api.recordings import RecordedRun, read
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable
 from hilctl.experiment.open_loop import write_response
+from hilctl.lab.response.bode import write_responses
+from hilctl.lab.response.feedback_design import (
+    FeedbackDesign,
+    design_feedback,
+    write_design,
+)
+from hilctl.lab.response.frequency_response import (
+    FrequencyResponse,
+    Signals,
+    frequency_response,
+)
+from hilctl.lab.response.segment_spectrum import SegmentSpectrum, spectra, write_spectra
+from hilctl.lab.response.step_response import SETTLED_PERCENT, StepResponse
+from hilctl.lab.response.step_response import step_response as measured_step
 
 Result = TypeVar("Result")
 

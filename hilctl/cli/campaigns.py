@@ -31,27 +31,27 @@ from hilctl.cli.options import (
 )
 from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.file import label_settings
-from hilctl.ilc.ilc_session import IlcResult, IlcRow, correction_setting
-from hilctl.run.control.client import finish_dead_runs
-from hilctl.run.start import StepStoppedError
-from hilctl.studies.campaign.campaign_runner import CampaignResult
-from hilctl.studies.campaign.plan import CampaignPlan
-from hilctl.studies.campaign.steps import (
+from hilctl.lab.ilc.ilc_session import IlcResult, IlcRow, correction_setting
+from hilctl.lab.studies.campaign.campaign_runner import CampaignResult
+from hilctl.lab.studies.campaign.plan import CampaignPlan
+from hilctl.lab.studies.campaign.steps import (
     CampaignStep,
     CampaignSteps,
     campaign_of,
     cell,
     load_campaign,
 )
-from hilctl.studies.campaign.store import CampaignRow
-from hilctl.studies.multi_run.collect import COMPLETED
-from hilctl.studies.multi_run.varied_parameter import (
+from hilctl.lab.studies.campaign.store import CampaignRow
+from hilctl.lab.studies.multi_run.collect import COMPLETED
+from hilctl.lab.studies.multi_run.varied_parameter import (
     VariedParameter,
     dimensions,
     plain_text,
     short_value,
     texts_of,
 )
+from hilctl.run.control.client import finish_dead_runs
+from hilctl.run.start import StepStoppedError
 
 _RESUMES = "the same command resumes from there"
 Folder = Annotated[

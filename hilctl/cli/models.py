@@ -22,14 +22,14 @@ from hilctl.cli.options import (
     recordings_argument,
 )
 from hilctl.cli.output import print_result
-from hilctl.comparison.compare import Comparison, headings, notes, table_rows
-from hilctl.identify.model_selection import OrderScore
-from hilctl.identify.pipeline import Identification
-from hilctl.identify.refine.acceptance import TOLERANCE_PERCENT
-from hilctl.identify.refine.refinement import Refinement
-from hilctl.identify.registry import CATALOGUE
-from hilctl.identify.settings import setting_rows
-from hilctl.identify.summary import (
+from hilctl.lab.comparison.compare import Comparison, headings, notes, table_rows
+from hilctl.lab.identify.model_selection import OrderScore
+from hilctl.lab.identify.pipeline import Identification
+from hilctl.lab.identify.refine.acceptance import TOLERANCE_PERCENT
+from hilctl.lab.identify.refine.refinement import Refinement
+from hilctl.lab.identify.registry import CATALOGUE
+from hilctl.lab.identify.settings import setting_rows
+from hilctl.lab.identify.summary import (
     class_table,
     loop_table,
     parameter_texts,
@@ -192,7 +192,7 @@ def identify(
             on_progress=progress,
         )
     if html is not None:
-        from hilctl.identify.model_page import identification_page  # it imports matplotlib
+        from hilctl.lab.identify.model_page import identification_page  # it imports matplotlib
 
         write_text(html, identification_page(result), overwrite=True)
     refused = result.verdict.grade == "not a model"
@@ -237,7 +237,7 @@ def refine(
             on_progress=progress,
         )
     if html is not None:
-        from hilctl.identify.model_page import refinement_page  # it imports matplotlib
+        from hilctl.lab.identify.model_page import refinement_page  # it imports matplotlib
 
         write_text(html, refinement_page(result), overwrite=True)
     written = str(output) if output and result.better else None

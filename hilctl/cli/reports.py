@@ -30,7 +30,7 @@ from hilctl.run.control.client import finish_dead_runs
 
 if TYPE_CHECKING:
     from hilctl.analysis.replay import ReplayResult
-    from hilctl.studies.multi_run.collect import RunSeries
+    from hilctl.lab.studies.multi_run.collect import RunSeries
 
 RunsInput = Annotated[list[Path], recordings_argument("Recordings (MCAP), or a campaign folder.")]
 OtherModel = Annotated[
@@ -70,7 +70,7 @@ def report(
             series = api.report_runs(
                 runs, html, model=model, overwrite=overwrite, on_progress=on_progress
             )
-        from hilctl.studies.multi_run.multi_run_page import series_mapping  # matplotlib
+        from hilctl.lab.studies.multi_run.multi_run_page import series_mapping  # matplotlib
 
         values = series_mapping(series)
         print_result(values, lambda: print_rich(render_series(series)), as_json=as_json)
@@ -172,7 +172,7 @@ def _minutes(report: RunReport) -> Table:
 
 def render_series(series: "RunSeries") -> Group:
     """Return the summary of several runs and a table of them."""
-    from hilctl.studies.multi_run.multi_run_page import MOST_ROWS, run_table  # matplotlib
+    from hilctl.lab.studies.multi_run.multi_run_page import MOST_ROWS, run_table  # matplotlib
 
     headings, rows = run_table(series, MOST_ROWS, short=True)
     cells = [[printable(cell) for cell in row] for row in rows]

@@ -7,12 +7,6 @@ import typer
 from rich.console import Group
 
 from hilctl import api
-from hilctl.analysis.response.bode import fit_rows, line_table
-from hilctl.analysis.response.feedback_design import FeedbackDesign
-from hilctl.analysis.response.feedback_design import figure_rows as loop_rows
-from hilctl.analysis.response.frequency_response import FrequencyResponse, Signals
-from hilctl.analysis.response.segment_spectrum import SegmentSpectrum, spectrum_rows
-from hilctl.analysis.response.step_response import SETTLED_PERCENT, StepResponse
 from hilctl.base.formatting import printable, quantity
 from hilctl.cli.console import listing, print_rich, table
 from hilctl.cli.options import (
@@ -25,6 +19,12 @@ from hilctl.cli.options import (
     recordings_argument,
 )
 from hilctl.cli.output import print_result
+from hilctl.lab.response.bode import fit_rows, line_table
+from hilctl.lab.response.feedback_design import FeedbackDesign
+from hilctl.lab.response.feedback_design import figure_rows as loop_rows
+from hilctl.lab.response.frequency_response import FrequencyResponse, Signals
+from hilctl.lab.response.segment_spectrum import SegmentSpectrum, spectrum_rows
+from hilctl.lab.response.step_response import SETTLED_PERCENT, StepResponse
 
 
 def frf(

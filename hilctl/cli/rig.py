@@ -26,11 +26,11 @@ from hilctl.cli.options import (
 )
 from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.file import label_settings
+from hilctl.lab.studies.calibrate import CalibrationFit
+from hilctl.lab.studies.characterise.characterisation_runner import CharacterisationPlan
+from hilctl.lab.studies.characterise.results import Characterisation, StepRow
+from hilctl.lab.studies.characterise.rig_page import HELD_OUT_HEADINGS, figure_rows, held_out_rows
 from hilctl.run.start import StepStoppedError
-from hilctl.studies.calibrate import CalibrationFit
-from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
-from hilctl.studies.characterise.results import Characterisation, StepRow
-from hilctl.studies.characterise.rig_page import HELD_OUT_HEADINGS, figure_rows, held_out_rows
 
 _RESUMES = "the same command resumes from this step"
 calibrate_ = typer.Typer(rich_markup_mode=None)

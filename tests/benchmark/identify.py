@@ -15,13 +15,13 @@ os.environ.setdefault("OPENBLAS_NUM_THREADS", "1")
 import numpy as np
 from scipy.optimize import least_squares
 
-from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.evaluation import Evaluation, judge
-from hilctl.identify.fit_api import FitRequest
-from hilctl.identify.fit_data import FitData
-from hilctl.identify.fit_model import fit_model
-from hilctl.identify.settings import FitSettings
 from hilctl.kernels.hysteresis import deadband_block
+from hilctl.lab.identify.data.records import SteadyLoop
+from hilctl.lab.identify.evaluation import Evaluation, judge
+from hilctl.lab.identify.fit_api import FitRequest
+from hilctl.lab.identify.fit_data import FitData
+from hilctl.lab.identify.fit_model import fit_model
+from hilctl.lab.identify.settings import FitSettings
 from hilctl.models.integrated import IntegratedModel, exponential_integrated
 from tests.rig import steady_loop
 

@@ -8,9 +8,13 @@ import pytest
 
 ROOT = Path(__file__).parents[2]
 PACKAGES = {"hilctl": ROOT / "hilctl", "hilctl_drivers": ROOT / "drivers" / "hilctl_drivers"}
-LIBRARIES = {"api", "base", "kernels", "models"}
+LIBRARIES = {"api", "base", "kernels", "lab", "models"}
 """Rooms without private modules."""
-ROOMS = {each.parent.name for each in PACKAGES["hilctl"].glob("*/__init__.py")} - LIBRARIES
+ROOMS = {
+    ".".join(each.parent.relative_to(PACKAGES["hilctl"]).parts)
+    for pattern in ("*/__init__.py", "lab/*/__init__.py")
+    for each in PACKAGES["hilctl"].glob(pattern)
+} - LIBRARIES
 
 
 def imports(path):
@@ -31,7 +35,7 @@ IMPORTS = {
 
 def used_by_others(room):
     """Return the modules of a room that files outside of it import."""
-    folder = PACKAGES["hilctl"] / room
+    folder = PACKAGES["hilctl"].joinpath(*room.split("."))
     modules = {
         ".".join(each.relative_to(folder).with_suffix("").parts) for each in folder.rglob("*.py")
     }

@@ -28,18 +28,18 @@ from mcap.records import Attachment, Channel, Message, Metadata, Schema
 from mcap.writer import CompressionType, Writer
 
 from hilctl.analysis.catalogue import entry_of
-from hilctl.analysis.decimation import overview
 from hilctl.analysis.export import export
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.analysis.run_page import page
 from hilctl.base.errors import ConfigError, HilctlError
 from hilctl.base.segments import Segment
 from hilctl.cli.reports import render_report
 from hilctl.experiment.device_state import initial_state_after
-from hilctl.identify.data.cycles import loops_from_pieces
-from hilctl.identify.data.data_files import history_from_pieces
 from hilctl.kernels.hysteresis import play_sum
+from hilctl.lab.identify.data.cycles import loops_from_pieces
+from hilctl.lab.identify.data.data_files import history_from_pieces
+from hilctl.lab.run_report.decimation import overview
+from hilctl.lab.run_report.run_page import page
 from hilctl.models.base import HysteresisModel
 from hilctl.models.implicit_models import BoucWenModel, KrasnoselskiiPokrovskiiModel, PreisachModel
 from hilctl.models.linear_stages import FirstMode, FurtherMode

@@ -11,10 +11,10 @@ from typer.testing import CliRunner
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.cli.commands import app
-from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import FitRequest
-from hilctl.identify.fit_model import fit_model
-from hilctl.identify.settings import FitSettings
+from hilctl.lab.identify.evaluation import judge
+from hilctl.lab.identify.fit_api import FitRequest
+from hilctl.lab.identify.fit_model import fit_model
+from hilctl.lab.identify.settings import FitSettings
 from hilctl.models.model_file import dump_model, load_model
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, start_run

@@ -11,13 +11,13 @@ from pathlib import Path
 import pytest
 
 from hilctl.analysis.report import summarize
+from hilctl.lab.studies.characterise.characterisation_runner import (
+    CharacterisationRunner,
+)
+from hilctl.lab.studies.step_runner import StudyHost
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, unpaced
 from hilctl.run.unpaced import run_unpaced
-from hilctl.studies.characterise.characterisation_runner import (
-    CharacterisationRunner,
-)
-from hilctl.studies.step_runner import StudyHost
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RIG = CONFIGS / "terfenol_sine_6a.yaml"

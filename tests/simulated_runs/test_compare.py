@@ -7,8 +7,8 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
-from hilctl.comparison.simulated_trials import TrialDevice
 from hilctl.experiment.load import load_experiment
+from hilctl.lab.comparison.simulated_trials import TrialDevice
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment
 from hilctl.run.unpaced import run_unpaced

@@ -1,16 +1,17 @@
 """Campaigns without real time over several processes: the same as in one."""
 
+from hilctl.lab.studies.campaign.campaign_runner import StudyHost, planned_fast, run_fast
+from hilctl.lab.studies.campaign.steps import load_campaign
 from hilctl.recording.reader import read
-from hilctl.studies.campaign.campaign_runner import StudyHost, planned_fast, run_fast
-from hilctl.studies.campaign.steps import load_campaign
-from tests.unit.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
+from tests.unit.lab.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 
 BUDGET = "set: {limits.rms_current_a: 1.3, limits.thermal_time_constant_s: 2.0}\n"
 
 
 def test_processes_give_the_table_of_one(tmp_path, monkeypatch):
     monkeypatch.setattr(
-        "hilctl.studies.campaign.campaign_runner.write_series", lambda _series, path: path.touch()
+        "hilctl.lab.studies.campaign.campaign_runner.write_series",
+        lambda _series, path: path.touch(),
     )
     (tmp_path / "rig.yaml").write_text(EXPERIMENT, encoding="utf-8")
     (tmp_path / "few.yaml").write_text(CAMPAIGN + BUDGET, encoding="utf-8")

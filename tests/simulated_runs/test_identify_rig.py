@@ -11,11 +11,11 @@ from typing import Any
 import numpy as np
 import pytest
 
-from hilctl.identify.data.records import SteadyLoop
-from hilctl.identify.evaluation import judge
-from hilctl.identify.fit_api import FitRequest
-from hilctl.identify.fit_model import FittedModel, fit_model
-from hilctl.identify.settings import FitKind, FitSettings
+from hilctl.lab.identify.data.records import SteadyLoop
+from hilctl.lab.identify.evaluation import judge
+from hilctl.lab.identify.fit_api import FitRequest
+from hilctl.lab.identify.fit_model import FittedModel, fit_model
+from hilctl.lab.identify.settings import FitKind, FitSettings
 from hilctl.signals.cycle_metrics import fold, peak_hysteresis_percent
 from hilctl_drivers.simulated.terfenol import TerfenolParameters
 from tests.rig import RATE_HZ, driven, steady_loop

@@ -13,7 +13,7 @@ from hilctl.analysis.report import summarize
 from hilctl.cli.commands import app
 from hilctl.experiment.correction import load_correction
 from hilctl.experiment.load import load_experiment
-from hilctl.ilc.ilc_session import IlcSession
+from hilctl.lab.ilc.ilc_session import IlcSession
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.staged import FieldLag, StagedModel

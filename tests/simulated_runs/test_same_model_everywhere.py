@@ -16,11 +16,11 @@ import pytest
 import scipy
 
 from hilctl.base.types import F64
-from hilctl.identify.data.records import History
-from hilctl.identify.fit_api import FitRequest
-from hilctl.identify.fit_model import fit_model
-from hilctl.identify.registry import CATALOGUE, HISTORIES
-from hilctl.identify.settings import FitSettings
+from hilctl.lab.identify.data.records import History
+from hilctl.lab.identify.fit_api import FitRequest
+from hilctl.lab.identify.fit_model import fit_model
+from hilctl.lab.identify.registry import CATALOGUE, HISTORIES
+from hilctl.lab.identify.settings import FitSettings
 from tests.commands import ended
 from tests.rig import RATE_HZ, driven, steady_loop
 

@@ -6,11 +6,11 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.analysis import html
 from hilctl.base.events import Event
 from hilctl.base.samples import Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, I64, U32
+from hilctl.lab.pages import html
 from hilctl.recording.recording import Recording, Ticks
 
 MakeRecording = Callable[..., Recording]

@@ -39,7 +39,7 @@ def test_a_model_is_identified_and_written(table, tmp_path):
 def test_arguments_are_passed_on(monkeypatch):
     seen = {}
     monkeypatch.setattr(
-        "hilctl.comparison.compare.compare",
+        "hilctl.lab.comparison.compare.compare",
         lambda paths, models, **named: seen.update(named, paths=paths, models=models),
     )
     api.compare("a.mcap", ["ppi"], settings={"block": 5}, frequencies_hz=[1.0])

@@ -24,8 +24,8 @@ def test_figures_are_axes_and_files(file, tmp_path):
 
 def test_figures_of_one_recording_are_those_of_its_page(file, tmp_path, monkeypatch):
     pages, seen = [], {}
-    monkeypatch.setattr("hilctl.analysis.html.figures", lambda sheets: pages.extend(sheets) or "")
-    monkeypatch.setattr("hilctl.studies.multi_run.plots.drawn", lambda sheet, width: Figure())
+    monkeypatch.setattr("hilctl.lab.pages.html.figures", lambda sheets: pages.extend(sheets) or "")
+    monkeypatch.setattr("hilctl.lab.studies.multi_run.plots.drawn", lambda sheet, width: Figure())
     page = tmp_path / "page.html"
     assert api.report_page(file, page) == api.summarize(file)
     figures = api.figures(file, tmp_path / "one", formats="svg", on_written=seen.__setitem__)

@@ -9,14 +9,14 @@ import pytest
 from hilctl.base.errors import ConfigError
 from hilctl.cli.campaigns import print_campaign, print_row, sweep_document
 from hilctl.experiment.correction import Correction, LearnedCycle
-from hilctl.ilc.ilc_session import IlcResult, IlcRow
-from hilctl.studies.campaign.campaign_runner import CampaignResult
-from hilctl.studies.campaign.plan import planned
-from hilctl.studies.campaign.steps import CampaignStep, load_campaign
-from hilctl.studies.campaign.store import CampaignRow
-from hilctl.studies.multi_run.digest import RunFigures
-from hilctl.studies.multi_run.varied_parameter import dimensions
-from tests.unit.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
+from hilctl.lab.ilc.ilc_session import IlcResult, IlcRow
+from hilctl.lab.studies.campaign.campaign_runner import CampaignResult
+from hilctl.lab.studies.campaign.plan import planned
+from hilctl.lab.studies.campaign.steps import CampaignStep, load_campaign
+from hilctl.lab.studies.campaign.store import CampaignRow
+from hilctl.lab.studies.multi_run.digest import RunFigures
+from hilctl.lab.studies.multi_run.varied_parameter import dimensions
+from tests.unit.lab.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 
 pytestmark = pytest.mark.usefixtures("undrawn")
 

@@ -7,12 +7,12 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.cli.models import _numbers, column_of, headings, notes, render_comparison, table_rows
-from hilctl.comparison.compare import compare
 from hilctl.experiment.examples import examples_folder
-from hilctl.identify.settings import IdentifySettings
+from hilctl.lab.comparison.compare import compare
+from hilctl.lab.identify.settings import IdentifySettings
 from hilctl.models.model_file import dump_model, load_model
 from tests.fakes import SteppingClock
-from tests.unit.identify.refine.conftest import OLD, actuator, history
+from tests.unit.lab.identify.refine.conftest import OLD, actuator, history
 
 
 def test_every_setting_is_listed(hilctl):

@@ -6,13 +6,13 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.analysis import html
 from hilctl.analysis.replay import ReplayResult
 from hilctl.analysis.replay import replay as recompute
 from hilctl.cli.console import print_rich
 from hilctl.cli.reports import print_replay, render_series
-from hilctl.studies.multi_run.collect import RunSeries
-from tests.unit.studies.multi_run.conftest import grown
+from hilctl.lab.pages import html
+from hilctl.lab.studies.multi_run.collect import RunSeries
+from tests.unit.lab.studies.multi_run.conftest import grown
 
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
 RUN = GOLDEN / "terfenol_uncompensated.mcap"

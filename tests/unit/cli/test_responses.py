@@ -4,7 +4,7 @@ from pathlib import Path
 
 import pytest
 
-from tests.unit.analysis.response.test_bode import SMALL
+from tests.unit.lab.response.test_bode import SMALL
 
 RUN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
 

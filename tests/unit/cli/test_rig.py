@@ -10,11 +10,11 @@ from hilctl.base.calibration import CalibrationFile
 from hilctl.base.errors import RunError
 from hilctl.base.yaml import load_document
 from hilctl.cli.rig import print_characterisation, print_plan, print_step
+from hilctl.lab.studies.characterise.characterisation_runner import CharacterisationPlan
+from hilctl.lab.studies.characterise.results import Characterisation, StepRow
 from hilctl.run.start import StepStoppedError, unpaced
-from hilctl.studies.characterise.characterisation_runner import CharacterisationPlan
-from hilctl.studies.characterise.results import Characterisation, StepRow
-from tests.unit.studies.characterise.conftest import experiment, limits, limits_with
-from tests.unit.studies.characterise.test_results import FOUND, identification
+from tests.unit.lab.studies.characterise.conftest import experiment, limits, limits_with
+from tests.unit.lab.studies.characterise.test_results import FOUND, identification
 
 __all__ = ["experiment", "limits", "limits_with"]
 

@@ -8,7 +8,7 @@ import pytest
 from hilctl.base.samples import Flag, Samples
 from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, cooled
 from hilctl.experiment.load import load_experiment
-from tests.unit.studies.characterise.conftest import experiment
+from tests.unit.lab.studies.characterise.conftest import experiment
 
 __all__ = ["experiment"]
 

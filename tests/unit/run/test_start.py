@@ -24,7 +24,7 @@ from hilctl.run.start import (
     unpaced,
     unused,
 )
-from tests.unit.studies.campaign.conftest import experiment
+from tests.unit.lab.studies.campaign.conftest import experiment
 
 __all__ = ["experiment"]
 

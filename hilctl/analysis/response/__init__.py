@@ -1,1 +1,0 @@
-"""Frequency and step responses, spectra, feedback design: measurement, fit, plots and pages."""

@@ -1,0 +1,355 @@
+"""Fit of a model to records: the model, its errors, its provenance and its identified range.
+
+While the command is constant, neither hysteresis nor settled dynamics move the displacement. So
+creep is fitted to such rests first and removed from the records, and models are fitted to the rest.
+"""
+
+import time
+from collections.abc import Iterator, Sequence
+from dataclasses import asdict, dataclass, replace
+from typing import Any
+
+import numpy as np
+import scipy
+from pydantic import ValidationError
+from scipy.fft import rfft, rfftfreq
+from scipy.optimize import nnls
+
+import hilctl
+from hilctl.base.errors import DataError
+from hilctl.base.types import F64, I64
+from hilctl.experiment.model_validity import ALL, QUIET, spectrum
+from hilctl.lab.identify.data.records import (
+    FEWEST_POINTS,
+    History,
+    Record,
+    SteadyLoop,
+    thinned,
+    turning_points,
+)
+from hilctl.lab.identify.evaluation import Evaluation, judge
+from hilctl.lab.identify.fit_api import FitJob, FitRequest, FoundModel
+from hilctl.lab.identify.fit_data import FitData
+from hilctl.lab.identify.registry import CATALOGUE
+from hilctl.lab.identify.resonances import without_modes
+from hilctl.models.base import IdentifiedRange, Provenance
+from hilctl.models.linear_stages import CreepModel
+from hilctl.signals import cycle_metrics
+
+COARSE_S = 1e-3
+LEAST_REST_S = 0.5
+STILL = 1e-6  # of the command's range, from sample to sample
+SETTLED_S = 0.01  # start of a rest that is ignored, until lags and structures have settled
+SHORTEST_S = 0.03  # time constant
+LONGEST = 10.0  # longest time constant, of the longest rest: slower creep looks linear
+APART = 2.0  # ratio of time constants, which approximate any law of creep
+FIRST_S, GROWTH = 0.005, 1.3  # first averaged interval of a rest, and ratio to the next
+ROUNDS = 4  # of a fixed-point iteration: each leaves a few percent of the error
+LEAST_SHARE = 1e-4
+CLEAR = 0.8  # part of the motion during rests that creep must explain
+MOST = 0.5  # maximum total share: a larger one is drift
+LEAST_MOVE = 3e-4  # of the stroke: minimum motion during rests
+
+
+@dataclass(frozen=True, slots=True)
+class _Rest:
+    """An interval of constant command in a history, and edges of its averaged parts."""
+
+    of: int
+    edges: I64
+
+    def means(self, signal: F64) -> F64:
+        """Return the mean of a signal in each part, less their mean: float64[m]."""
+        sums = np.add.reduceat(signal[: self.edges[-1]], self.edges[:-1])
+        means: F64 = sums / np.diff(self.edges)
+        means -= means.mean()
+        return means
+
+
+def creep_of(records: Sequence[Record]) -> CreepModel | None:
+    """Return the creep during rests; None if there is none, or fewer than two rests of 0.5 s."""
+    histories, rests = _resting(records)
+    if len(rests) < 2:
+        return None
+    least_squares = _LeastSquares(histories, rests)
+    creep = None
+    for _ in range(ROUNDS):
+        creep = least_squares.solve([_bare_um(history, creep) for history in histories])
+        if creep is None:
+            return None
+    return creep
+
+
+def creeps(records: Sequence[Record]) -> bool:
+    """Return whether displacements move during rests, other than by heat and drift."""
+    histories, rests = _resting(records)
+    return len(rests) > 1 and _LeastSquares(histories, rests).moves
+
+
+def _resting(records: Sequence[Record]) -> tuple[list[History], list[_Rest]]:
+    """Return coarse histories, and their rests."""
+    histories = [_coarse(record) for record in records if isinstance(record, History)]
+    return histories, [rest for i, each in enumerate(histories) for rest in _rests(i, each)]
+
+
+def without_creep(records: Sequence[Record], creep: CreepModel) -> tuple[Record, ...]:
+    """Return records with creep removed from histories."""
+    return tuple(
+        replace(record, displacement_um=_bare_um(record, creep) + record.displacement_um[0])
+        if isinstance(record, History)
+        else record
+        for record in records
+    )
+
+
+def _coarse(history: History) -> History:
+    """Return a history averaged over milliseconds: creep is slower by far."""
+    together = max(1, int(COARSE_S * history.sample_rate_hz))
+    count = history.command.size // together
+    if together == 1 or count < FEWEST_POINTS:
+        return history
+    whole = np.stack((history.command, history.displacement_um))[:, : count * together]
+    command, displacement_um = whole.reshape(2, count, together).mean(axis=2)
+    return History(history.label, command, displacement_um, history.sample_rate_hz / together)
+
+
+def _rests(number: int, history: History) -> Iterator[_Rest]:
+    """Yield the rests of a history."""
+    rate_hz = history.sample_rate_hz
+    still = np.abs(np.diff(history.command)) <= STILL * np.ptp(history.command)
+    turns = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
+    for start, stop in turns.reshape(-1, 2).tolist():
+        if stop - start >= LEAST_REST_S * rate_hz:
+            yield _Rest(number, _edges(start, stop + 1, rate_hz))
+
+
+def _edges(start: int, stop: int, rate_hz: float) -> I64:
+    """Return edges of parts that become longer, as creep becomes slower."""
+    parts = int(np.log1p((stop - start) / rate_hz * (GROWTH - 1.0) / FIRST_S) / np.log(GROWTH))
+    ends_s = SETTLED_S + FIRST_S * (GROWTH ** np.arange(parts + 1) - 1.0) / (GROWTH - 1.0)
+    edges = np.unique(start + np.round(rate_hz * ends_s).astype(np.int64))
+    return np.append(edges[edges < stop], stop)
+
+
+def _bare_um(history: History, creep: CreepModel | None) -> F64:
+    """Return a displacement less its first value and without creep: float64[n]."""
+    y_um: F64 = history.displacement_um - history.displacement_um[0]
+    return y_um if creep is None else creep.inverse(history.sample_rate_hz).process(y_um)
+
+
+class _LeastSquares:
+    """Least-squares fit of shares of given time constants, with heat and drift beside them."""
+
+    def __init__(self, histories: Sequence[History], rests: Sequence[_Rest]) -> None:
+        self._histories, self._rests = histories, rests
+        longest_s = max(
+            (rest.edges[-1] - rest.edges[0]) / histories[rest.of].sample_rate_hz for rest in rests
+        )
+        count = 1 + int(np.log(LONGEST * longest_s / SHORTEST_S) / np.log(APART))
+        self._times_s = SHORTEST_S * APART ** np.arange(count, dtype=np.float64)
+        heat = self._means([np.cumsum(history.command**2) for history in histories])
+        drift = self._means([history.time_s for history in histories])
+        self._others = np.linalg.qr(np.stack((heat, drift), axis=1))[0]
+        measured = self._means([history.displacement_um for history in histories])
+        self._measured_um = self._rest_of(measured)
+        self._least_um = LEAST_MOVE * max(float(np.ptp(each.displacement_um)) for each in histories)
+
+    @property
+    def moves(self) -> bool:
+        """Whether the motion during rests is clear."""
+        # The noise of the shortest parts alone reaches the least motion at low sample rates.
+        return cycle_metrics.rms(self._measured_um) > self._least_um
+
+    def solve(self, bare_um: Sequence[F64]) -> CreepModel | None:
+        """Return the creep of displacements, float64[n] each; None if there is none."""
+        moves = np.stack([self._moved(bare_um, time_s) for time_s in self._times_s], axis=1)
+        shares, left = nnls(moves, self._measured_um)
+        explained = 1.0 - (left / max(float(np.linalg.norm(self._measured_um)), 1e-300)) ** 2
+        worth = shares > LEAST_SHARE
+        moved_um = float(np.abs(moves @ shares).max())
+        if explained < CLEAR or shares.sum() > MOST or not moved_um > self._least_um:
+            return None
+        return CreepModel(
+            time_constants_s=tuple(self._times_s[worth].tolist()),
+            shares=tuple(shares[worth].tolist()),
+        )
+
+    def _moved(self, bare_um: Sequence[F64], time_s: float) -> F64:
+        """Return the motion of an element of share 1 during rests: float64[M]."""
+        element = CreepModel(time_constants_s=(time_s,), shares=(1.0,))
+        crept = [
+            element.forward(history.sample_rate_hz).process(x_um) - x_um
+            for history, x_um in zip(self._histories, bare_um, strict=True)
+        ]
+        return self._rest_of(self._means(crept))
+
+    def _means(self, signals: Sequence[F64]) -> F64:
+        return np.concatenate([rest.means(signals[rest.of]) for rest in self._rests])
+
+    def _rest_of(self, means: F64) -> F64:
+        """Return the part that heat and drift do not explain."""
+        return means - self._others @ (self._others.T @ means)
+
+
+EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
+"""Kinds with a lag: for the others, long records are thinned."""
+
+
+def fit_kind(request: FitRequest) -> FoundModel:
+    """Fit a kind of model to records without creep and known modes, which become its parts."""
+    records, settings, unit = request.records, request.settings, request.unit
+    modes = request.modes if settings.looks_for("modes") else ()
+    linear = settings.looks_for("creep_stage") and not settings.looks_for("activation")
+    creep = creep_of(records) if linear else None
+    bare = records if creep is None else without_creep(records, creep)
+    bare = without_modes(bare, modes) if modes else bare
+    data = FitData(bare if settings.kind in EVERY_SAMPLE else thinned(bare), unit)
+    structure = settings.looks_for("structure") and (request.structure or True)
+    job = FitJob(data, settings, request.run, request.progress, request.start, structure)
+    try:
+        found = CATALOGUE[settings.kind].fit(job)
+    except ValidationError as error:
+        rule = f"the best fit of --model {settings.kind} is no valid model"
+        cure = "choose another kind, or remove faulty samples (steps, spikes, drift) from the data"
+        raise DataError(f"{rule} ({error.errors()[0]['msg']}): {cure}") from None
+    known, parameters, numbers = dict[str, Any](), dict(found.parameters), found.numbers
+    if creep is not None:
+        known["creep"] = creep
+        parameters["creep_share"] = sum(creep.shares)
+        numbers += len(creep.shares)
+    for k, mode in enumerate(modes, start=2):
+        known["modes"] = tuple(modes)
+        parameters |= {f"{name}_{k}": value for name, value in mode.model_dump().items()}
+        numbers += len(type(mode).model_fields)
+    if not known:
+        return found
+    known["output_range_um"] = FitData(records, unit).output_range_um
+    model = found.model.model_copy(update=known)
+    return replace(found, model=model, numbers=numbers, parameters=parameters)
+
+
+SMALL, FEWEST_SWINGS = 0.1, 10
+NOT_ZERO_UM = 1e-6
+LEAST = 0.01  # part of a history's power below its lowest frequency
+
+
+def identified_range(data: FitData) -> IdentifiedRange:
+    """Return the range of motions, frequencies and speeds of the records."""
+    moves = [float(np.ptp(data.target_um[place])) for place in data.places]
+    speeds = [
+        move * float(np.abs(record.rate()).max()) / float(np.ptp(record.command))
+        for move, record in zip(moves, data.records, strict=True)
+    ]
+    lowest, highest = zip(*map(frequencies_hz, data.records), strict=True)
+    return IdentifiedRange(
+        peak_to_peak_um=(min(map(smallest_um, data.records)), max(moves)),
+        frequency_hz=(min(lowest), max(highest)),
+        speed_um_per_s=max(speeds),
+    )
+
+
+def smallest_um(record: Record) -> float:
+    """Return the peak-to-peak of a loop, or of a history's smaller swings."""
+    # A tenth of the path is in smaller ones: noise, and the end of decaying cycles.
+    displacement_um = record.displacement_um
+    if isinstance(record, History):
+        at = record.ignore + turning_points(record.command[record.ignore :])
+        swings_um = np.sort(np.abs(np.diff(displacement_um[at])))
+        displacement_um = displacement_um[record.evaluated()]
+        if swings_um.size >= FEWEST_SWINGS:
+            way_um = np.cumsum(swings_um)
+            found = float(swings_um[np.searchsorted(way_um, SMALL * way_um[-1])])
+            return max(found, NOT_ZERO_UM)
+    return float(np.ptp(displacement_um))
+
+
+def frequencies_hz(record: Record) -> tuple[float, float]:
+    """Return the lowest and the highest frequency of a record's command."""
+    command = record.command
+    power = np.cumsum(np.abs(rfft(command - command.mean())) ** 2)
+    if isinstance(record, SteadyLoop):
+        harmonics = max(int(np.searchsorted(power, ALL * power[-1])), 1)
+        return record.frequency_hz, record.frequency_hz * harmonics
+    first = int(np.searchsorted(power, LEAST * power[-1]))
+    lowest = float(rfftfreq(command.size, 1.0 / record.sample_rate_hz)[max(first, 1)])
+    quiet = QUIET * float(np.ptp(command))
+    rate_hz = record.sample_rate_hz
+    main_hz = spectrum(command, rate_hz, lowest, quiet).main_hz
+    # The end of a sweep is resolved by windows that are not longer than its fast motions need.
+    return lowest, max(lowest, spectrum(command, rate_hz, max(lowest, main_hz), quiet).highest_hz)
+
+
+VERSIONS = {"hilctl": hilctl.__version__, "numpy": np.__version__, "scipy": scipy.__version__}
+
+
+@dataclass(frozen=True, kw_only=True)
+class FittedModel(Evaluation, FoundModel):
+    """An identified model with its provenance, and its errors on the fitted records."""
+
+    elapsed_s: float
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return all fields as plain mappings, lists and numbers, for JSON."""
+        return {
+            "model": {"kind": getattr(self.model, "kind"), **self.model.to_mapping()},  # noqa: B009
+            **Evaluation.to_mapping(self),
+            "starts": [asdict(start) for start in self.starts],
+            "numbers": self.numbers,
+            "parameters": self.parameters,
+            "standard_errors": self.standard_errors,
+            "at_bound": list(self.at_bound),
+            "elapsed_s": self.elapsed_s,
+        }
+
+
+def fit_model(request: FitRequest) -> FittedModel:
+    """Fit a model's parameters to steady loops and time histories.
+
+    The criterion is the published sum of squared displacement errors (4.9, 5.14, 6.24) over all
+    points of all loops, subject to the published bounds and to the conditions for the inverse.
+
+    The linear algebra is many small steps: with more than one BLAS thread on a busy machine they
+    take up to 30 times as long, so programs set ``OPENBLAS_NUM_THREADS=1`` before NumPy loads.
+    Raise DataError if the data can't be used as asked, or there are none.
+    """
+    begin, settings = time.perf_counter(), request.settings
+    data = FitData(request.records, request.unit)
+    found = fit_kind(request)
+    judged = judge(found.model, data, creep=settings.creep)
+    provenance = Provenance(
+        source=tuple(request.source),
+        method="; ".join(filter(None, (CATALOGUE[settings.kind].title, settings.changes()))),
+        grid=tuple(map(_grid_line, request.records)),
+        parameters=found.parameters,
+        errors_percent=error_table(judged),
+        identified_range=identified_range(data),
+        versions=VERSIONS,
+    )
+    request.progress(1.0, "done")
+    model = found.model.model_copy(update={"provenance": provenance})
+    known = vars(judged) | vars(found) | {"model": model, "end": None}
+    return FittedModel(**known, elapsed_s=time.perf_counter() - begin)
+
+
+def _grid_line(record: Record) -> str:
+    """Return a one-line description of a record."""
+    command = record.command
+    low, high = float(command.min()), float(command.max())
+    if isinstance(record, SteadyLoop):
+        points = f"{command.size} points at {record.frequency_hz:g} Hz"
+    else:
+        points = f"{command.size} samples at {record.sample_rate_hz:g} Hz"
+        points += f", first {record.ignore} ignored"
+    return f"{record.label}: {low:.4g} to {high:.4g}, {points}"
+
+
+def error_table(judged: Evaluation) -> dict[str, float]:
+    """Return the errors by name."""
+    areas = [error.area_error_percent for error in judged.errors]
+    table = {
+        "peak": judged.peak_percent,
+        "rms": judged.rms_percent,
+        "own_peak": judged.own_peak_percent,
+    }
+    known = [abs(area) for area in areas if area is not None]
+    return table | ({"area": max(known)} if known else {})

@@ -1,0 +1,369 @@
+"""Choose the kind of model, its size and the lag of tables by errors on held-out data.
+
+A kind is chosen by the geometric mean of its errors by stroke. The rms error of whole histories is
+that of their large motions, and does not show a kind whose small loops are several times worse.
+"""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import dataclass, replace
+from itertools import zip_longest
+from typing import Any
+
+import numpy as np
+
+from hilctl.base.errors import DataError
+from hilctl.base.types import F64
+from hilctl.lab.identify.data.records import History, Record, Records, SteadyLoop
+from hilctl.lab.identify.evaluation import Evaluation, judge, judgement_of
+from hilctl.lab.identify.fit_api import FitRequest, OnProgress, ignore_progress
+from hilctl.lab.identify.fit_data import FitData
+from hilctl.lab.identify.fit_model import creeps, fit_kind, fit_model
+from hilctl.lab.identify.parallel import MapFunction
+from hilctl.lab.identify.settings import FitSettings, IdentifySettings
+
+FEWEST_LOOPS = 4
+FOLDS = 3
+SEED = 1
+HEAD = 0.7  # part of a history that is fitted if the rest is held out
+SAME = 0.02  # of a span: what counts as within it
+MOVES = 0.1  # of a history's peak-to-peak: least motion of a last part that is held out
+
+
+@dataclass(frozen=True, slots=True)
+class Split:
+    """Records of one fit, and held-out ones that it is evaluated on."""
+
+    fitted: tuple[Record, ...]
+    held_out: tuple[Record, ...]
+
+
+@dataclass(frozen=True, slots=True)
+class HeldOut:
+    """Errors on held-out data, whose origin is ``how``; a fit to all can start from ``end``."""
+
+    judgement: Evaluation
+    records: tuple[Record, ...]
+    how: str
+    end: object | None = None
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return the errors as plain mappings, lists and numbers, for JSON."""
+        return self.judgement.to_mapping() | {"how": self.how}
+
+
+def folds_of(records: Sequence[Record], validate: Sequence[Record] = ()) -> list[Split]:
+    """Return the folds; none if there are too few data.
+
+    Records that extend the range of commands, frequencies or speeds are not held out, since a model
+    need not be valid beyond its range. Of histories the last part is held out, or each in turn if
+    no last part is within the range of the rest. Otherwise ``validate`` is held out.
+    """
+    given = [Split(tuple(records), tuple(validate))] if validate else []
+    if any(isinstance(record, History) for record in records):
+        heads, tails = zip(*map(_halved, records), strict=True)
+        held_out = tuple(tail for tail in tails if tail is not None)
+        if held_out:
+            return [Split(heads, held_out)]
+        folds = [
+            Split((*records[:i], *records[i + 1 :]), (record,)) for i, record in enumerate(records)
+        ]
+        inner = [each for each in folds if each.fitted and _within(each.held_out[0], each.fitted)]
+        return inner or given
+    if len(records) < FEWEST_LOOPS:
+        return given
+    divided = []
+    # Every third of a grid in its own order would be all loops of one frequency.
+    mixed = np.random.default_rng(SEED).permutation(len(records)).tolist()
+    for first in range(FOLDS):
+        members = sorted(mixed[first::FOLDS])
+        rest = [record for i, record in enumerate(records) if i not in members]
+        out = [records[i] for i in members if _within(records[i], rest)]
+        fitted = tuple(r for r in records if not any(r is other for other in out))
+        if out:
+            divided.append(Split(fitted, tuple(out)))
+    return divided or given
+
+
+def held_out_error(request: FitRequest) -> HeldOut | None:
+    """Return errors of a fit on held-out parts of its data; None if they are too few."""
+    request.progress(0.0, "fits with held-out data")
+    (found,) = held_out_errors([request], request.run)
+    return found
+
+
+def held_out_errors(requests: Sequence[FitRequest], run: MapFunction) -> list[HeldOut | None]:
+    """Return the errors of one start of each fit on held-out data; None if too few are left."""
+    tasks = [
+        (number, fold, replace(
+            request,
+            records=fold.fitted,
+            settings=request.settings.model_copy(update={"starts": 1}),
+            run=map,
+            progress=ignore_progress,
+        ))
+        for number, request in enumerate(requests)
+        for fold in folds_of(request.records, request.validate)
+    ]  # fmt: skip
+    done: list[list[tuple[Split, F64, object | None]]] = [[] for _ in requests]
+    for (number, fold, _), found in zip(tasks, run(_fitted, tasks), strict=True):
+        if found is not None:
+            done[number].append((fold, *found))
+    return [_together(*each) for each in zip(requests, done, strict=True)]
+
+
+def _fitted(task: tuple[int, Split, FitRequest]) -> tuple[F64, object | None] | None:
+    """Return the response to the held-out data, and where the search ended."""
+    _, fold, request = task
+    try:
+        found = fit_kind(request)
+    except DataError:  # too few records for this kind of fit; all of them may be enough
+        return None
+    judged = judge(found.model, fold.held_out, creep=request.settings.creep)
+    return np.concatenate(judged.modelled_um), found.end
+
+
+def _together(
+    request: FitRequest, done: Sequence[tuple[Split, F64, object | None]]
+) -> HeldOut | None:
+    if not done:
+        return None
+    held_out = tuple(record for fold, _, _ in done for record in fold.held_out)
+    responses_um = np.concatenate([modelled for _, modelled, _ in done])
+    parts = "histories (or their last parts)" if isinstance(held_out[-1], History) else "loops"
+    how = f"{len(held_out)} of {len(request.records)} {parts}, held out in turn"
+    stroke_um = FitData(request.records).stroke_um
+    judgement = judgement_of(FitData(held_out, request.unit), responses_um, stroke_um)
+    return HeldOut(judgement, held_out, how, done[-1][2])
+
+
+def _halved(record: Record) -> tuple[Record, Record | None]:
+    """Return the fitted and the held-out part of a record; no part of a loop is held out."""
+    if isinstance(record, SteadyLoop):
+        return record, None
+    command, displacement_um, held = record.command, record.displacement_um, record.held
+    cut = record.ignore + round(HEAD * (command.size - record.ignore))
+    try:
+        head = replace(
+            record,
+            command=command[:cut],
+            displacement_um=displacement_um[:cut],
+            held=held[held < cut],
+        )
+        tail = replace(record, ignore=cut)
+    except DataError:
+        return record, None
+    moves = np.ptp(displacement_um[cut:]) > MOVES * np.ptp(displacement_um)
+    return (head, tail) if moves and _within(record, [head]) else (record, None)
+
+
+def _within(record: Record, others: Sequence[Record]) -> bool:
+    reached = np.max([_extremes(other) for other in others], axis=0)
+    return bool(np.all(_extremes(record) <= reached + SAME * np.abs(reached)))
+
+
+def _extremes(record: Record) -> F64:
+    """Return command, frequency and speed, both ways, that held-out records may not exceed."""
+    command = record.command
+    frequency_hz = record.frequency_hz if isinstance(record, SteadyLoop) else 0.0
+    speed = float(np.abs(record.rate()).max())
+    return np.array([command.max(), -command.min(), frequency_hz, -frequency_hz, speed])
+
+
+WHOLE: tuple[Mapping[str, Any], ...] = (
+    {"kind": "field", "drags": 0, "plays": 8, "cells": 12, "knots": 16},
+    {"kind": "generalised_duhem", "cells": 12, "across": 8},
+)
+"""Candidates for histories: a small model of each kind, which is identified quickly."""
+CREEPING: Mapping[str, Any] = {**WHOLE[0], "activation": True}
+"""Further candidate for histories whose rests show creep."""
+PLAIN: Mapping[str, Any] = {"kind": "integrated", "offset": True}
+"""Further candidate for histories if the error of all others is large."""
+WELL_PERCENT = 0.6  # mean error by stroke that small models of the right kind reach
+IN_FULL: Mapping[str, tuple[dict[str, Any], ...]] = {
+    "field": ({"kind": "field", "drags": 0}, {"kind": "field"}),
+    "generalised_duhem": ({"kind": "generalised_duhem"},),
+}
+"""Larger candidates of a kind whose small model has a small error, one after the other: the small
+loops of a field may creep."""
+LONGEST = max(map(len, IN_FULL.values()))
+NEAR = 2.0  # times the least error: a small model of the best kind may have it
+WORTH = 0.95  # of the error: a larger model must be below it, since it slows every run
+LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated", "offset": True})
+"""Candidates for steady loops."""
+ORDERS = ((6, 4), (8, 6), (12, 8), (16, 10), (20, 12), (28, 16))
+"""Plays, and deadbands on each side if the model has any."""
+WORTH_SIZE = 1.03  # a larger model must lower the error by more than 3 %
+MOST_LAG = 8  # samples tried
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateScore:
+    """Errors of one kind of model on held-out data, in percent of the largest stroke."""
+
+    settings: str
+    rms_percent: float
+    peak_percent: float
+    stroke_percent: float  # that kinds are compared by, in percent of the motions' own peak-to-peak
+
+
+@dataclass(frozen=True, slots=True)
+class OrderScore:
+    """Errors of one size on held-out data, of the stroke."""
+
+    plays: int
+    deadbands_a_side: int
+    rms_percent: float
+    peak_percent: float
+
+
+@dataclass(frozen=True, slots=True)
+class Selection:
+    """Selected settings, their errors on held-out data, and those of everything tried."""
+
+    settings: FitSettings
+    held_out: HeldOut | None = None
+    candidates: tuple[CandidateScore, ...] = ()
+    orders: tuple[OrderScore, ...] = ()
+
+
+def select(request: FitRequest) -> Selection:
+    """Select the open kind or size by held-out errors; raise DataError if data are too few."""
+    settings = request.settings
+    if isinstance(settings, IdentifySettings) and settings.auto:
+        return _choose_kind(request, settings)
+    return _choose_order(request) if settings.size == "auto" else Selection(settings)
+
+
+def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
+    """Return the kind with the least error."""
+    # Small models select the kinds to try at full size: a wrong kind is far off at any size.
+    whole = any(isinstance(record, History) for record in request.records)
+    creeping = given.creep_stage and creeps(request.records)
+    histories = (*WHOLE, CREEPING) if creeping else WHOLE
+    errors = _candidates(request, given, histories if whole else LOOPS)
+    if whole and not any(each.stroke_percent < WELL_PERCENT for each in errors):
+        errors += _candidates(request, given, (PLAIN,))
+    if not errors:
+        raise DataError(f"too few data to select a kind of model: {_undivided(request.records)}")
+    best = min(errors, key=lambda tried: tried.stroke_percent)
+    near = [each for each in errors if each.stroke_percent <= NEAR * best.stroke_percent]
+    for turn in range(LONGEST if whole else 0):
+        chains = [(IN_FULL.get(each.settings.kind, ())[turn:], each) for each in near]
+        larger = [(chain[0] | _activation(each), each) for chain, each in chains if chain]
+        starts = [each.held_out.end for _, each in larger]
+        kinds = [more for more, _ in larger]
+        found = _candidates(request, given, kinds, starts)
+        if not any(each.stroke_percent < WELL_PERCENT for each in found):
+            found += _candidates(request, given, kinds)  # the small model may have misled them
+        errors += found
+        better = [x for x in found if x.stroke_percent < WORTH * best.stroke_percent]
+        best = min(better, key=lambda tried: tried.stroke_percent, default=best)
+        near = [best] if best in found else []
+    return Selection(best.settings, best.held_out, candidates=tuple(e.candidate for e in errors))
+
+
+def _undivided(records: Sequence[Record]) -> str:
+    """Return why nothing was held out, with a remedy."""
+    record = records[0]
+    if not isinstance(record, History):
+        return (
+            f"{len(records)} steady loops, at least {FEWEST_LOOPS} are needed. Add loops at other "
+            "amplitudes and frequencies, or set --model staged"
+        )
+    cut_s = record.time_s[record.ignore + round(HEAD * (record.command.size - record.ignore))]
+    return (
+        f"from {cut_s:.4g} s, '{record.label}' moves further or faster than before, or hardly. "
+        "Add a file of other motions with --validate, or set --model field"
+    )
+
+
+def _activation(tried: "_Tried") -> dict[str, Any]:
+    """Return the settings of plays that creep, for a larger model of the same kind."""
+    # Each of them costs as much per sample as eight that do not.
+    return {"activation": True, "plays": 16} if tried.settings.looks_for("activation") else {}
+
+
+def _choose_order(request: FitRequest) -> Selection:
+    """Return the smallest size whose error is near the least."""
+    settings = request.settings
+    sizes = [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
+    request.progress(0.0, f"fits of {len(sizes)} sizes with held-out data")
+    errors = _tried(request, [("", size) for size in sizes])
+    if not errors:
+        raise DataError("too few data to hold some out and select the number of plays: set plays=N")
+    most = WORTH_SIZE * min(each.rms_percent for each in errors)
+    best = next(each for each in errors if each.rms_percent <= most)
+    return Selection(best.settings, best.held_out, orders=tuple(each.order for each in errors))
+
+
+@dataclass(frozen=True, slots=True)
+class _Tried:
+    name: str
+    settings: FitSettings
+    held_out: HeldOut
+
+    @property
+    def rms_percent(self) -> float:
+        return self.held_out.judgement.rms_percent
+
+    @property
+    def stroke_percent(self) -> float:
+        return self.held_out.judgement.stroke_percent
+
+    @property
+    def candidate(self) -> CandidateScore:
+        peak_percent = self.held_out.judgement.peak_percent
+        return CandidateScore(self.name, self.rms_percent, peak_percent, self.stroke_percent)
+
+    @property
+    def order(self) -> OrderScore:
+        settings = self.settings
+        plays, deadbands = settings.plays, settings.deadbands if settings.has("deadbands") else 0
+        return OrderScore(plays, deadbands, self.rms_percent, self.held_out.judgement.peak_percent)
+
+
+def _tried(
+    request: FitRequest,
+    named: Sequence[tuple[str, FitSettings]],
+    starts: Sequence[object | None] = (),
+) -> list[_Tried]:
+    """Return the errors of settings that can be fitted; searches begin where others ended."""
+    requests = [
+        replace(request, settings=settings, start=start)
+        for (_, settings), start in zip_longest(named, starts)
+    ]
+    found = zip(named, held_out_errors(requests, request.run), strict=True)
+    return [_Tried(name, settings, out) for (name, settings), out in found if out is not None]
+
+
+def _candidates(
+    request: FitRequest,
+    given: IdentifySettings,
+    candidates: Sequence[Mapping[str, Any]],
+    starts: Sequence[object | None] = (),
+) -> list[_Tried]:
+    shared: dict[str, Any] = {"whole": given.whole, "table": given.table, "points": given.points}
+    names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
+    request.progress(0.0, "; ".join(names))
+    settings = [IdentifySettings(**each, **shared) for each in candidates]
+    parts = {name: getattr(given, name) for name in ("creep_stage", "modes", "structure")}
+    settings = [
+        each.model_copy(update={name: on for name, on in parts.items() if each.has(name)})
+        for each in settings
+    ]
+    return _tried(request, list(zip(names, settings, strict=True)), starts)
+
+
+def choose_lag(
+    load: Callable[[int], Records], settings: FitSettings, run: MapFunction, progress: OnProgress
+) -> int:
+    """Return the lag with the least error; ``load`` returns data shifted by that many samples."""
+    progress(0.0, f"{MOST_LAG + 1} fits for the lag of the displacement")
+    lean = settings.model_copy(update={"starts": 1})
+    requests = [FitRequest(tuple(load(lag)), lean) for lag in range(MOST_LAG + 1)]
+    return int(np.argmin(list(run(_rms_um, requests))))
+
+
+def _rms_um(request: FitRequest) -> float:
+    fit = fit_model(request)
+    return fit.rms_percent * max(error.peak_to_peak_um for error in fit.errors)

@@ -1,0 +1,167 @@
+"""Identify a model from records, and evaluate it."""
+
+from collections.abc import Callable, Mapping, Sequence
+from dataclasses import asdict, dataclass, replace
+from datetime import UTC, datetime
+from typing import Any
+
+from hilctl.base.formatting import shown_briefly
+from hilctl.base.yaml import Document
+from hilctl.lab.identify.data.records import History, Record
+from hilctl.lab.identify.evaluation import judge
+from hilctl.lab.identify.fit_api import FitRequest
+from hilctl.lab.identify.fit_data import FitData
+from hilctl.lab.identify.fit_model import FittedModel, error_table, fit_model
+from hilctl.lab.identify.model_quality import Verdict, verdict_of
+from hilctl.lab.identify.model_selection import (
+    CandidateScore,
+    HeldOut,
+    OrderScore,
+    Selection,
+    held_out_error,
+    select,
+)
+from hilctl.lab.identify.registry import entry
+from hilctl.lab.identify.resonances import WORTH, further_modes
+from hilctl.lab.identify.settings import IdentifySettings
+from hilctl.models.linear_stages import FirstMode, FurtherMode
+
+TURNS = 4  # each identifies a new model
+
+
+@dataclass(frozen=True, slots=True)
+class Found:
+    """A model with given modes, its settings, and its errors on held-out data if there are any."""
+
+    fit: FittedModel
+    held_out: HeldOut | None
+    selection: Selection
+
+    @property
+    def rms_percent(self) -> float:
+        """The error on held-out data; on all data if none were held out."""
+        return (self.held_out.judgement if self.held_out else self.fit).rms_percent
+
+
+def with_modes(
+    records: Sequence[Record],
+    identify: Callable[[Sequence[FurtherMode], Selection | None], Found],
+) -> Found:
+    """Return a model with the further modes that its records show.
+
+    A missing mode distorts all other parameters, so a model of the selected kind is identified
+    again with each mode that is found, and its residual shows the modes more clearly.
+    """
+    best = identify((), None)
+    histories = [record for record in records if isinstance(record, History)]
+    if not best.selection.settings.looks_for("modes") or len(histories) < len(records):
+        return best
+    for _ in range(TURNS):
+        model = best.fit.model
+        structure, known = getattr(model, "structure", None), getattr(model, "modes", ())
+        first_hz = structure.natural_hz if isinstance(structure, FirstMode) else None
+        better = further_modes(histories, best.fit.modelled_um, known, first_hz)
+        if better is None:
+            break
+        tried = identify(better, best.selection)
+        if not tried.rms_percent < WORTH * best.rms_percent:
+            break
+        best = tried
+    return best
+
+
+@shown_briefly
+@dataclass(frozen=True, slots=True)
+class Identification:
+    """An identified model, and its errors on held-out data.
+
+    Attributes:
+        orders: Errors of each number of plays, if it was selected.
+        lag_samples: Assumed lag of tables' displacements in samples.
+        understood: Columns and units of each table in words.
+    """
+
+    fit: FittedModel
+    data: Sequence[Record]
+    verdict: Verdict
+    held_out: HeldOut | None
+    orders: tuple[OrderScore, ...]
+    lag_samples: int
+    candidates: tuple[CandidateScore, ...] = ()
+    understood: tuple[str, ...] = ()
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return all results as plain mappings, lists and numbers, for JSON."""
+        return {
+            "verdict": self.verdict.to_mapping(),
+            "held_out": None if self.held_out is None else self.held_out.to_mapping(),
+            **self.fit.to_mapping(),
+            "orders": [asdict(order) for order in self.orders],
+            "candidates": [asdict(candidate) for candidate in self.candidates],
+            "lag_samples": self.lag_samples,
+            "tables": list(self.understood),
+        }
+
+
+def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
+    """Return the settings of a kind, changed by texts; raise InputError with all problems."""
+    if kind == "auto":
+        document = Document("hilctl identify", "kind: field\nauto: true")
+    else:
+        known, _ = entry(kind)
+        document = Document("hilctl identify", f"kind: {known}")
+    for text in texts:
+        document.set(text)
+    return document.validate(IdentifySettings)
+
+
+def identify_records(request: FitRequest) -> Identification:
+    """Fit a model to records, and evaluate it; raise DataError if they can't be used."""
+    records, validate = request.records, request.validate
+
+    def found(modes: Sequence[FurtherMode], selection: Selection | None) -> Found:
+        asked = replace(request, modes=modes)
+        if selection is None:
+            selection = select(asked)
+        elif selection.held_out:
+            start = selection.held_out.end
+            again = replace(asked, settings=selection.settings, start=start)
+            selection = replace(selection, held_out=held_out_error(again))
+        held_out = selection.held_out
+        chosen = replace(asked, settings=selection.settings)
+        fit = fit_model(replace(chosen, start=held_out.end if held_out else None))
+        if held_out is None and not validate:
+            held_out = held_out_error(chosen)
+        return Found(fit, held_out, selection)
+
+    best = with_modes(records, found)
+    fit, held_out, selection = best.fit, best.held_out, best.selection
+    if validate:
+        stroke_um = FitData(records).stroke_um
+        others = judge(fit.model, validate, creep=request.settings.creep, stroke_um=stroke_um)
+        how = "files that were not fitted"
+        if held_out is not None and held_out.records[0] is validate[0]:
+            how += ", but selected the kind of model"
+        held_out = HeldOut(others, tuple(validate), how)
+    update: dict[str, Any] = {"created": datetime.now(UTC).isoformat(timespec="seconds")}
+    if held_out is not None:
+        figures = {f"held_out_{k}": v for k, v in error_table(held_out.judgement).items()}
+        update["errors_percent"] = {**fit.model.provenance.errors_percent, **figures}
+    fit = _with_provenance(fit, update)
+    verdict = verdict_of(fit, records, selection.settings, held_out)
+    identification = Identification(
+        fit, records, verdict, held_out, selection.orders, 0, selection.candidates
+    )
+    return with_verdict(identification, verdict)
+
+
+def with_verdict(found: Identification, verdict: Verdict) -> Identification:
+    """Return an identification with a verdict, whose errors by stroke its model has."""
+    errors = {each.label: each.peak_percent for each in verdict.classes}
+    fit = _with_provenance(found.fit, {"errors_by_stroke": errors})
+    return replace(found, fit=fit, verdict=verdict)
+
+
+def _with_provenance(fit: FittedModel, update: Mapping[str, Any]) -> FittedModel:
+    provenance = fit.model.provenance.model_copy(update=update)
+    return replace(fit, model=fit.model.model_copy(update={"provenance": provenance}))

@@ -1,0 +1,109 @@
+"""Text rows and lines about an identified or a refined model."""
+
+from collections.abc import Sequence
+from typing import TypeAlias
+
+from hilctl.lab.identify.evaluation import Evaluation, LoopScore
+from hilctl.lab.identify.fit_model import FittedModel
+from hilctl.lab.identify.model_quality import Verdict
+from hilctl.lab.identify.pipeline import Identification
+from hilctl.lab.identify.refine.acceptance import ErrorChange
+from hilctl.lab.identify.refine.refinement import Refinement
+
+Table: TypeAlias = tuple[tuple[str, ...], list[tuple[str, ...]]]
+"""Headings, and rows of texts."""
+
+
+def loop_table(errors: Sequence[LoopScore]) -> Table:
+    """Return the errors of each loop."""
+    return ("loop", "p-p µm", "peak %", "rms %", "area %"), [
+        (
+            *_row(error.label, error.peak_to_peak_um, error.peak_percent, error.rms_percent),
+            "-" if error.area_error_percent is None else f"{error.area_error_percent:+.2f}",
+        )
+        for error in errors
+    ]
+
+
+def _row(label: str, *figures: float) -> tuple[str, ...]:
+    return (label, *(f"{figure:.3g}" for figure in figures))
+
+
+def parameter_texts(fit: FittedModel) -> list[tuple[str, str]]:
+    """Return names and values, with standard errors if known, and marks at bounds."""
+    return [(name, f"{value:.6g}" + _mark(fit, name)) for name, value in fit.parameters.items()]
+
+
+def _mark(fit: FittedModel, name: str) -> str:
+    if name in fit.at_bound:
+        return " (at its bound)"
+    sure = fit.standard_errors
+    return f" ± {sure[name]:.2g}" if name in sure else ""
+
+
+def summary(found: Identification) -> list[str]:
+    """Return the result in a few lines, the grade first."""
+    fit, held_out, known = found.fit, found.held_out, found.fit.model.provenance.identified_range
+    spread = [start.rms_percent for start in fit.starts]
+    ended = f"{fit.numbers} fitted numbers"
+    if spread:
+        ended = f"{len(spread)} starts ended at rms {min(spread):.3f} to {max(spread):.3f} %"
+    lines = [str(found.verdict), *found.verdict.notes, *found.understood]
+    if held_out is not None:
+        lines.append(f"not fitted: {_errors(held_out.judgement)}; {held_out.how}")
+    lines += [
+        f"tried: {each.settings}: mean error by stroke {each.stroke_percent:.2f} %, "
+        f"peak error {each.peak_percent:.2f} %, rms {each.rms_percent:.2f} %"
+        for each in found.candidates
+    ]
+    lines += [f"fitted: {_errors(fit)}", f"{ended}, in {fit.elapsed_s:.2f} s"]
+    if known is not None:
+        lines.append(
+            f"identified for {_span(known.peak_to_peak_um)} µm peak-to-peak, "
+            f"{_span(known.frequency_hz)} Hz, up to {known.speed_um_per_s:.4g} µm/s"
+        )
+    if found.lag_samples:
+        lines.append(f"lag of the displacements: {found.lag_samples} samples")
+    return lines
+
+
+def _errors(judged: Evaluation) -> str:
+    return (
+        f"peak error {judged.peak_percent:.2f} %, rms {judged.rms_percent:.2f} % of the largest "
+        f"peak-to-peak; {judged.own_peak_percent:.2f} % of a record's own"
+    )
+
+
+def _span(limits: tuple[float, float]) -> str:
+    low, high = (f"{limit:.4g}" for limit in limits)
+    return low if low == high else f"{low} to {high}"
+
+
+def refinement_table(found: Refinement) -> Table:
+    """Return the errors of each held-out run before and after."""
+    return _change_table(("run", "p-p µm"), found.choice.runs)
+
+
+def class_table(found: Refinement) -> Table:
+    """Return the errors of each class of held-out runs before and after."""
+    return _change_table(("class", "largest p-p µm"), found.choice.classes)
+
+
+def _change_table(first: tuple[str, str], changes: Sequence[ErrorChange]) -> Table:
+    return (*first, "peak % before", "after", "rms % before", "after"), [
+        _row(e.label, e.peak_to_peak_um, e.peak_before, e.peak_after, e.before, e.after)
+        for e in changes
+    ]
+
+
+def stroke_table(verdict: Verdict) -> Table:
+    """Return the errors of each class of motions."""
+    return ("stroke", "peak %", "rms %", "motions"), [
+        (*_row(each.label, each.peak_percent, each.rms_percent), f"{each.motions}")
+        for each in verdict.classes
+    ]
+
+
+def worse_lines(found: Refinement) -> list[str]:
+    """Return one line per held-out run whose error increases with the accepted model."""
+    return [f"worse: {run}" for run in found.worse] if found.better else []

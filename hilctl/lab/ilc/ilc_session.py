@@ -1,0 +1,312 @@
+"""Session of iterative learning: repeated runs of one experiment, each with a new correction."""
+
+import json
+import signal
+import time
+from collections.abc import Callable, Sequence
+from dataclasses import asdict, dataclass, replace
+from pathlib import Path
+from typing import Any, TypeAlias
+
+import numpy as np
+
+from hilctl import __version__
+from hilctl.base.errors import ConfigError, HilctlError
+from hilctl.base.files import make_folder
+from hilctl.base.formatting import shown_briefly
+from hilctl.base.segments import Segment
+from hilctl.base.types import C128
+from hilctl.experiment.correction import (
+    Correction,
+    LearnedCycle,
+    fits,
+    signature,
+    write_correction,
+)
+from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.lab.ilc.cycle import CycleScore, cycle_error, harmonic_count
+from hilctl.lab.ilc.update import IlcState, learn, refused
+from hilctl.models.model_file import model_sha256
+from hilctl.recording.reader import read
+from hilctl.run.result import RunResult
+from hilctl.run.stalls import fault_of, repeated
+from hilctl.run.start import StepStoppedError, checked_experiment, paced
+
+HIGHEST_PART = 0.125
+"""Highest frequency of a correction, as a share of the sample rate."""
+
+_FEWEST_CYCLES = 2
+
+
+def repeating(checked: CheckedExperiment) -> list[Segment]:
+    """Return the periodic segments to learn, the first of equal ones.
+
+    Raise ConfigError if none has enough cycles, or without a compensator.
+    """
+    loaded = checked.loaded
+
+    def refuse(key: str, rule: str, hint: str) -> ConfigError:
+        return ConfigError([loaded.problem(key, rule, hint=hint)])
+
+    if loaded.model is None:
+        raise refuse("compensator", "is needed to learn: its input is corrected", "set a model")
+    found: list[Segment] = []
+    known: list[LearnedCycle] = []
+    for segment in checked.reference.segments:
+        wanted = signature(checked.reference.values, segment)
+        if wanted is None or segment.steady_cycles()[2] < _FEWEST_CYCLES:
+            continue
+        if any(fits(cycle, checked.reference.values, segment) for cycle in known):
+            continue
+        found.append(segment)
+        nothing = np.zeros(1, dtype=np.complex128)
+        known.append(LearnedCycle.from_coefficients(segment.label, segment.period, wanted, nothing))
+    if not found:
+        rule = f"must repeat for at least {_FEWEST_CYCLES} whole cycles after its soft start"
+        raise refuse("waveform", rule, "16 or more average the noise well")
+    return found
+
+
+def beginning(checked: CheckedExperiment, segment: Segment) -> IlcState:
+    """Return the initial state, from the correction of the experiment if it has one."""
+    rate_hz = checked.reference.sample_rate_hz
+    highest_hz = HIGHEST_PART * rate_hz
+    count = harmonic_count(segment.period, rate_hz / segment.period, highest_hz)
+    first: C128 = np.zeros(count + 1, dtype=np.complex128)
+    known = checked.loaded.correction
+    for cycle in known.cycles if known else ():
+        if fits(cycle, checked.reference.values, segment):
+            size = min(first.size, cycle.coefficients.size)
+            first[:size] = cycle.coefficients[:size]
+    return IlcState(rate_hz, highest_hz, first)
+
+
+Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
+"""Function that runs an experiment file with settings and records it."""
+
+
+def correction_setting(file: Path) -> str:
+    """Return the ``key=value`` text that selects a correction file."""
+    # Quoted, because "lab #3" would end at the space, and "a: b" would be a mapping.
+    return f"compensator.correction={json.dumps(str(file.resolve()), ensure_ascii=False)}"
+
+
+@dataclass(frozen=True, slots=True)
+class IlcRow:
+    """Result of one run for one waveform.
+
+    Attributes:
+        run: Number of the run; 0 is the first, before learning.
+        floor_percent: Peak error that sensor noise alone would cause.
+        delay_samples: Delay between correction and displacement, identified so far.
+        natural_hz: Resonance identified so far; None without one.
+    """
+
+    run: int
+    label: str
+    error_percent: float
+    rms_percent: float
+    floor_percent: float
+    cycles: int
+    reach_hz: float
+    delay_samples: float
+    natural_hz: float | None
+    recording: str
+
+
+@shown_briefly
+@dataclass(frozen=True, slots=True)
+class IlcResult:
+    """Result of learning.
+
+    Attributes:
+        check: Verification run with the best correction, for each waveform; none if stopped.
+        stop_signal: Number of the signal that stopped it, or 0.
+        fault: Whether a run ended by a fault, or could not be run or evaluated.
+    """
+
+    correction: Correction
+    rows: tuple[IlcRow, ...]
+    check: tuple[IlcRow, ...]
+    reason: str
+    stop_signal: int = 0
+    fault: bool = False
+
+    def to_mapping(self) -> dict[str, Any]:
+        """Return plain values, without the coefficients."""
+        return {
+            "reason": self.reason,
+            "waveforms": [
+                {
+                    "label": cycle.label,
+                    "start_percent": cycle.start_percent,
+                    "error_percent": cycle.error_percent,
+                }
+                for cycle in self.correction.cycles
+            ],
+            "check": [asdict(row) for row in self.check],
+            "runs": [asdict(row) for row in self.rows],
+        }
+
+
+def row_of(
+    number: int, segment: Segment, error: CycleScore, state: IlcState, reach_hz: float, path: Path
+) -> IlcRow:
+    """Return the row of a run for one waveform, with the state of learning after the run."""
+    return IlcRow(
+        run=number,
+        label=segment.label,
+        error_percent=error.percent,
+        rms_percent=100.0 * error.rms_um / error.peak_to_peak_um,
+        floor_percent=error.floor_percent,
+        cycles=error.cycles,
+        reach_hz=reach_hz,
+        delay_samples=state.response.delay_s * state.sample_rate_hz,
+        natural_hz=state.response.natural_hz,
+        recording=str(path),
+    )
+
+
+class IlcSession:
+    """Session that learns the correction of every periodic waveform of an experiment.
+
+    Learning continues from the correction of the experiment, if it has one. Raise InputError if it
+    has no compensator, or no waveform with enough whole steady cycles.
+    """
+
+    def __init__(
+        self, experiment: Path, settings: Sequence[str], folder: Path, run: Runner = paced
+    ) -> None:
+        self._experiment, self._settings = experiment, list(settings)
+        self._folder, self._run = folder, run
+        self._checked = checked_experiment(experiment, settings)
+        self._segments = repeating(self._checked)
+        self._learning = [beginning(self._checked, each) for each in self._segments]
+        self._rows: list[IlcRow] = []
+        self._refusals: list[str] = []
+
+    def learn(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> IlcResult:
+        """Run and learn until the error no longer improves.
+
+        Raises:
+            InputError: The first run is rejected; nothing has moved.
+            RunError: The first run ended by a fault.
+        """
+        make_folder(self._folder)
+        reason, stop_signal, fault = "", 0, False
+        check: tuple[IlcRow, ...] = ()
+        try:
+            reason = self._runs_until_done(cycles, on_rows)
+            check = self._check()
+        except (KeyboardInterrupt, HilctlError) as error:
+            if not self._rows:
+                raise
+            stopped = isinstance(error, StepStoppedError | KeyboardInterrupt)
+            fault = not stopped
+            stop_signal = 0 if fault else getattr(error, "signal", signal.SIGINT)
+            reason = "; ".join(filter(None, (reason, str(error) or "stopped by Ctrl-C")))
+        if self._refusals:
+            reason += f"; {len(self._refusals)} corrections were refused: {self._refusals[-1]}"
+        return IlcResult(self._best(), tuple(self._rows), check, reason, stop_signal, fault)
+
+    def _runs_until_done(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> str:
+        """Run and learn; return the reason for the end."""
+        for number in range(cycles + 1):
+            try:
+                path = self._next_run(number, [each.next_um for each in self._learning])
+            except ConfigError as error:
+                if not self._rows:
+                    raise
+                self._refusals.append(str(error))
+                self._learning = [refused(each) for each in self._learning]
+            else:
+                rows = self._judge(number, path, learning=True)
+                self._rows += rows
+                on_rows(rows)
+            if all(each.done for each in self._learning):
+                return "; ".join(sorted({each.done for each in self._learning}))
+        return f"no convergence in {cycles} learning cycles: specify more with --cycles"
+
+    def _next_run(self, number: int, coefficients: Sequence[C128]) -> Path:
+        """Run with a correction, which is kept beside the recording; return that."""
+        name = f"run-{number:02d}"
+        file = self._folder / f"{name}.yaml"
+        cycles = [
+            self._cycle(segment, each)
+            for segment, each in zip(self._segments, coefficients, strict=True)
+        ]
+        write_correction(file, self._whole(cycles), overwrite=True)
+        noise = self._checked.loaded.noise_settings(number)  # which must not be learned
+        settings = [*self._settings, correction_setting(file), *noise]
+        path = self._folder / f"{name}.mcap"
+        return repeated(lambda: self._completed(f"run {number}", settings, path))
+
+    def _completed(self, name: str, settings: Sequence[str], path: Path) -> Path:
+        result = self._run(self._experiment, settings, path)
+        text = f"{name}: {result.reason}"
+        if result.stop_signal and self._rows:
+            raise StepStoppedError(text, result.stop_signal)
+        if result.code != "completed":
+            at_start = self._checked.loaded.config.safe.at_start
+            raise fault_of(text, result, read(result.path), at_start)
+        return result.path
+
+    def _judge(self, number: int, path: Path, *, learning: bool) -> list[IlcRow]:
+        recording = read(path)
+        # Samples before the waveform: a ramp, a condition, a rest.
+        before = recording.segments[0].start - self._checked.reference.segments[0].start
+        rows = []
+        for i, segment in enumerate(self._segments):
+            state = self._learning[i]
+            error = cycle_error(recording, segment.shifted(before), state.highest_hz)
+            reach_hz = state.reach_hz
+            if learning and not state.done:
+                state = learn(state, error)
+                if state.done:  # its correction stays while others are learned
+                    state = replace(state, next_um=state.best.correction_um)
+                self._learning[i] = state
+            rows.append(row_of(number, segment, error, state, reach_hz, path))
+        return rows
+
+    def _check(self) -> tuple[IlcRow, ...]:
+        """Verify the best corrections in another run, with new noise."""
+        number = self._rows[-1].run + 1
+        path = self._next_run(number, [each.best.correction_um for each in self._learning])
+        return tuple(self._judge(number, path, learning=False))
+
+    def _best(self) -> Correction:
+        cycles = []
+        for segment, state in zip(self._segments, self._learning, strict=True):
+            figures = {
+                "start_percent": state.trials[0].error.percent,
+                "error_percent": state.best.error.percent,
+            }
+            cycles.append(self._cycle(segment, state.best.correction_um, **figures))
+        return self._whole(cycles)
+
+    def _cycle(self, segment: Segment, coefficients: C128, **figures: float) -> LearnedCycle:
+        wanted = signature(self._checked.reference.values, segment)
+        assert wanted is not None
+        return LearnedCycle.from_coefficients(
+            segment.label, segment.period, wanted, coefficients, **figures
+        )
+
+    def _whole(self, cycles: Sequence[LearnedCycle]) -> Correction:
+        rate_hz = self._checked.reference.sample_rate_hz
+        provenance = {
+            "experiment": self._checked.loaded.config.name,
+            "device": self._checked.loaded.device.info.name,
+            "hilctl": __version__,
+            "created": time.strftime("%Y-%m-%dT%H:%M:%SZ", time.gmtime()),
+            "runs": str(len(self._rows) // len(self._segments)),
+        }
+        for segment, state in zip(self._segments, self._learning, strict=True):
+            if state.trials:
+                delay = state.response.delay_s * rate_hz
+                provenance[f"delay_samples: {segment.label}"] = f"{delay:.2f}"
+        return Correction(
+            sample_rate_hz=rate_hz,
+            model_sha256=model_sha256(self._checked.loaded.model),
+            cycles=tuple(cycles),
+            provenance=provenance,
+        )

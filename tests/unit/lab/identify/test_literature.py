@@ -1,0 +1,120 @@
+"""Models of the literature are identified from loops that they made."""
+
+import numpy as np
+import pytest
+
+from hilctl.lab.identify.data.records import History, SteadyLoop
+from hilctl.lab.identify.evaluation import judge
+from hilctl.lab.identify.fit_api import FitJob
+from hilctl.lab.identify.fit_data import FitData
+from hilctl.lab.identify.literature import (
+    fit_bouc_wen,
+    fit_duhem,
+    fit_generalised,
+    fit_kp,
+    fit_preisach,
+    fit_straight,
+)
+from hilctl.lab.identify.settings import FitSettings
+from hilctl.lab.identify.staged.staged_fits import fit_free
+from hilctl.models.implicit_models import (
+    BoucWenModel,
+    DuhemModel,
+    KrasnoselskiiPokrovskiiModel,
+    PreisachModel,
+)
+from hilctl.models.integrated import DeadbandFunction, IntegratedModel
+from hilctl.models.plays import GeneralisedModel, PlayEnvelope, PpiModel
+from tests.published import piezo_ppi
+
+RNG = np.random.default_rng(4)
+COMMON = {"command_span": (-7.0, 7.0), "output_offset_um": -3.0}
+PREISACH = PreisachModel(
+    **COMMON, thresholds=tuple((0.75 * np.arange(8)).tolist()), lowest=-6.0, cell=0.75,
+    slopes=tuple(tuple(row) for row in RNG.uniform(0.2, 2.0, (8, 16)).tolist()),
+)  # fmt: skip
+KP = KrasnoselskiiPokrovskiiModel(
+    **COMMON, lowest=-7.0, spacing=1.0,
+    weights=tuple(tuple(RNG.uniform(0.2, 1.0, i + 1).tolist()) for i in range(14)),
+)  # fmt: skip
+GENERALISED = GeneralisedModel(
+    **COMMON, direct=30.0, weights=(8.0, 5.0, 5.0), thresholds=(0.06, 0.12, 0.3),
+    rising=PlayEnvelope(slope=0.12, shift=0.3, level=-0.29),
+    falling=PlayEnvelope(slope=0.12, shift=0.35, level=-0.29),
+)  # fmt: skip
+BOUC_WEN = BoucWenModel(**COMMON, direct=8.0, hysteretic=2.0, beta=0.4, gamma=0.1)
+BOUC_WEN_2 = BoucWenModel(**COMMON, direct=8.0, hysteretic=2.0, beta=0.2, gamma=0.05, exponent=2)
+ASYMMETRIC = IntegratedModel(
+    direct=4.0, weights=(1.0, 1.5, 2.0), thresholds=(0.5, 1.5, 2.5), output_offset_um=1.0,
+    deadband=DeadbandFunction(
+        up_thresholds=(10.0, 20.0), up_weights=(-0.3, -0.2), down_thresholds=(-15.0,),
+        down_weights=(0.5,),
+    ),
+)  # fmt: skip
+SLOW = pytest.mark.slow
+
+FITS = [
+    (fit_straight, PpiModel(direct=3.0, weights=(), thresholds=(), output_offset_um=2.0), 1e-3),
+    (fit_preisach, PREISACH, 0.5),
+    (fit_kp, KP, 1.5),
+    pytest.param(fit_generalised, GENERALISED, 0.5, marks=SLOW),
+    (fit_bouc_wen, BOUC_WEN, 0.01),
+    (fit_bouc_wen, BOUC_WEN_2, 0.01),
+    (fit_duhem, DuhemModel(**COMMON, a=0.4, b=8.0, c=6.0), 0.01),
+    (fit_free, ASYMMETRIC, 1.0),
+]
+
+
+def found_by(fit, data):
+    """Return the model that a fit finds with the settings of its kind."""
+    kind = "asymmetric" if fit is fit_free else fit.__name__.removeprefix("fit_")
+    return fit(FitJob(data, FitSettings(kind=kind))).model
+
+
+@pytest.mark.parametrize(("fit", "truth", "peak_percent"), FITS)
+def test_a_model_of_its_own_kind_is_found_again(data_of, fit, truth, peak_percent):
+    data = data_of(truth)
+    model = found_by(fit, data)
+    assert judge(model, data).peak_percent <= peak_percent
+    assert model.input_range == pytest.approx((-6.0, 6.0), abs=1e-3)
+    low, high = data.output_range_um
+    y = 0.5 * (low + high) + 0.48 * (high - low) * np.sin(np.arange(2_000) / 100.0)
+    back = model.forward(1e4).process(model.inverse(1e4).process(y))
+    assert np.max(np.abs(back - y)[400:]) <= 1e-3 * data.stroke_um
+
+
+@pytest.mark.parametrize("fit", [
+    *(fit_straight, fit_preisach, fit_kp, fit_bouc_wen, fit_duhem, fit_free),
+    pytest.param(fit_generalised, marks=SLOW),
+])  # fmt: skip
+def test_commands_may_all_lie_on_one_side(fit):
+    """A drive of 10 to 90 V, as a piezo stage has it, is no special case."""
+    angle = 2.0 * np.pi * np.arange(300) / 300
+    command = np.tile(50.0 + 40.0 * np.sin(angle), 3)
+    displacement_um = piezo_ppi().forward(1.0).process(command)[-300:]
+    data = FitData([SteadyLoop("stage", command[-300:], displacement_um, 10.0)], "V")
+    most_percent = 12.0 if fit is fit_straight else 1.0
+    assert judge(found_by(fit, data), data).peak_percent <= most_percent
+
+
+def test_operators_that_only_drift_have_no_weight(data_of):
+    """Means that differ from loop to loop do not become weights that no loop shows.
+
+    With such weights the model would be far off when a run takes another path.
+    """
+    data = data_of(BOUC_WEN)
+    moved = [
+        SteadyLoop(loop.label, loop.command, loop.displacement_um - 20.0 * i, loop.frequency_hz)
+        for i, loop in enumerate(data.loops)
+    ]
+    model = found_by(fit_kp, FitData(moved, "A"))
+    there_and_back = np.concatenate([np.linspace(0, 6, 200), np.linspace(6, -6, 400)])
+    y = model.forward(1.0).process(there_and_back)
+    assert np.ptp(y) <= 1.15 * data.stroke_um
+
+
+def test_histories_are_fitted_like_loops():
+    time = np.arange(4000) / 1000.0
+    command = (1.0 + time) * np.sin(2.0 * np.pi * 5.0 * time)
+    data = FitData([History("growing", command, PREISACH.forward(1.0).process(command), 1000.0)])
+    assert judge(found_by(fit_preisach, data), data).peak_percent <= 1.0

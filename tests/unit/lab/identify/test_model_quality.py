@@ -1,0 +1,186 @@
+"""What is wrong with data is said; what can't be known from them is not promised."""
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+
+from hilctl.lab.identify import model_quality
+from hilctl.lab.identify.data.records import History
+from hilctl.lab.identify.fit_api import FitRequest
+from hilctl.lab.identify.pipeline import identify_records
+from hilctl.lab.identify.settings import FitSettings
+from hilctl.models.plays import PpiModel
+
+TRUTH = PpiModel(direct=4.0, weights=(1.0, 2.0), thresholds=(2.0, 4.0))
+GRID = [(a, f) for a in (2.0, 4.0, 6.0) for f in (10.0, 50.0, 100.0)]
+
+
+@pytest.fixture
+def grid(loop_of):
+    return [loop_of(TRUTH, a, f) for a, f in GRID]
+
+
+def judged(records, validate=(), **choices):
+    chosen = {"plays": 2, "starts": 1, "weights": "free", **choices}
+    return identify_records(
+        FitRequest(records, FitSettings(kind="ppi", **chosen), validate=validate)
+    )
+
+
+def changed(records, change):
+    return [replace(each, displacement_um=change(each.displacement_um)) for each in records]
+
+
+def test_a_model_that_holds_on_what_it_did_not_see_is_good(grid):
+    found = judged(grid)
+    assert found.verdict.grade == "good"
+    assert found.verdict.within_percent < 1.0
+    assert not found.verdict.notes
+    assert found.held_out.how.startswith("8 of 9 loops")
+    errors = found.fit.model.provenance.errors_percent
+    assert errors["held_out_own_peak"] == pytest.approx(found.verdict.within_percent)
+
+
+def test_an_error_on_what_was_not_fitted_decides(grid):
+    others = changed(grid[:1], lambda y: y + 0.1 * np.ptp(y))
+    verdict = judged(grid, others).verdict
+    assert verdict.grade == "poor"
+    assert verdict.within_percent == pytest.approx(10.0, abs=0.5)
+    far = judged(grid, changed(grid[:1], lambda y: y + 0.3 * np.ptp(y))).verdict
+    assert far.grade == "not a model"
+    assert "'sine 2 A 10 Hz'" in str(far)
+
+
+def dead(y):
+    return np.random.default_rng(y.size).normal(0.0, 0.05, y.size)
+
+
+@pytest.mark.parametrize(("change", "reason"), [
+    (dead, "explains 0 %"),
+    (lambda y: 1000.0 * y, "in nm"),
+    (lambda y: -y, "swap the wires"),
+    (np.abs, "--model butterfly"),
+])  # fmt: skip
+def test_data_that_are_no_actuator_s_are_refused_with_the_reason(grid, change, reason):
+    verdict = judged(changed(grid, change)).verdict
+    assert verdict.grade == "not a model"
+    assert reason in str(verdict)
+
+
+def test_swapped_columns_are_seen_by_what_comes_first(grid):
+    swapped = [replace(r, command=r.displacement_um, displacement_um=r.command) for r in grid]
+    assert "leads the command" in str(judged(swapped).verdict)
+
+
+def test_one_record_in_other_units_is_named(grid):
+    odd = [*grid[:4], *changed(grid[4:5], lambda y: y / 1000.0), *grid[5:]]
+    assert "'sine 4 A 50 Hz' has 0.00" in str(judged(odd).verdict)
+
+
+@pytest.mark.parametrize(
+    ("chosen", "note"),
+    [(slice(0, 1), "--validate"), (slice(0, None, 3), "10 Hz"), (slice(0, 3), "one amplitude")],
+)
+def test_what_a_campaign_can_t_know_is_said_and_nothing_is_good(grid, chosen, note):
+    verdict = judged(grid[chosen]).verdict
+    assert verdict.grade == "usable"
+    assert any(note in each for each in verdict.notes)
+
+
+def test_the_cause_of_an_error_is_named_before_a_model_is_poor(grid):
+    clipped = changed(grid, lambda y: np.minimum(y, 29.2))
+    verdict = judged(clipped).verdict
+    assert verdict.grade == "usable"
+    assert "end of its range" in verdict.notes[0]
+
+
+def test_drift_that_a_model_of_decaying_motions_hides_is_named():
+    time_s = np.arange(20_000) / 1000.0
+    command = (6.0 - 0.27 * time_s) * np.sin(2.0 * np.pi * time_s)
+    drifting_um = TRUTH.forward(1000.0).process(command) + 0.4 * time_s
+    verdict = judged([History("decay", command, drifting_um, 1000.0)]).verdict
+    assert any("drifts by" in text for text in (*verdict.reasons, *verdict.notes)), verdict
+
+
+def test_noise_is_named_as_the_cause_of_an_error():
+    time_s = np.arange(20_000) / 1000.0
+    command = (6.0 - 0.27 * time_s) * np.sin(2.0 * np.pi * time_s)
+    noise_um = 0.5 * np.random.default_rng(5).standard_normal(time_s.size)
+    noisy_um = TRUTH.forward(1000.0).process(command) + noise_um
+    verdict = judged([History("decay", command, noisy_um, 1000.0)]).verdict
+    assert verdict.grade == "poor"
+    assert "sensor noise, 0.5 µm rms" in verdict.notes[0]
+
+
+def test_noise_of_one_record_does_not_explain_the_error_of_others():
+    noise_um = np.random.default_rng(5).standard_normal(1000)
+    smooth_um = np.sin(np.arange(1000) / 50.0)
+    assert model_quality._noise([noise_um, 0.3 * smooth_um])
+    assert not model_quality._noise([noise_um, 3.0 * smooth_um])
+
+
+def test_turns_at_equal_distances_from_0_tell_drift_too():
+    time_s = np.arange(20_000) / 1000.0
+    command = 6.0 * np.round(np.sin(2.0 * np.pi * time_s), 3)
+    record = History("even", command, 5.0 * command + 0.4 * time_s, 1000.0)
+    assert "drifts by about 0.4 " in model_quality._drift(
+        np.tile([1.0, -1.0], 10_000), record, hidden=True
+    )
+
+
+def test_middles_that_move_with_the_amplitude_are_no_drift_of_a_usable_model():
+    time_s = np.arange(20_000) / 1000.0
+    command = (6.0 - 0.27 * time_s) * np.sin(2.0 * np.pi * time_s)
+    record = History("even", command, 5.0 * command + 0.3 * command**2, 1000.0)
+    assert model_quality._drift(np.tile([1.0, -1.0], 10_000), record, hidden=False) == ""
+
+
+def test_an_offset_is_suggested_where_the_error_is_one(grid):
+    moved = changed(grid, lambda y: y + 4.0)
+    verdict = judged(moved).verdict
+    assert any("offset=true" in note for note in verdict.notes)
+    assert not judged(moved, offset=True).verdict.notes
+
+
+def test_the_last_part_of_a_history_is_held_out():
+    time_s = np.arange(4000) / 1000.0
+    command = 5.0 * np.sin(2.0 * np.pi * 5.0 * time_s) * np.cos(2.0 * np.pi * 0.5 * time_s)
+    displacement_um = TRUTH.forward(1000.0).process(command)
+    displacement_um[3500:] += 5.0
+    found = judged([History("beat", command, displacement_um, 1000.0)])
+    assert found.held_out.records[0].ignore == 2800
+    assert found.held_out.judgement.own_peak_percent == pytest.approx(
+        500.0 / np.ptp(displacement_um[2800:]), rel=0.1
+    )
+    assert np.max(np.abs(found.held_out.judgement.modelled_um[0])) > 20.0
+
+
+@pytest.mark.parametrize(("command", "one_amplitude", "one_frequency"), [
+    (lambda t: np.sin(20.0 * np.pi * t), True, True),
+    (lambda t: np.sin(20.0 * np.pi * t) * (1.0 + t), False, True),
+    (lambda t: np.sin(20.0 * np.pi * t * (1.0 + t)), True, False),
+    (lambda t: np.sin(20.0 * np.pi * t) + 0.5 * np.sin(47.0 * np.pi * t), False, False),
+])  # fmt: skip
+def test_a_history_of_one_amplitude_or_frequency_tells_nothing_of_others(
+    command, one_amplitude, one_frequency
+):
+    t = np.arange(4000) / 2000.0
+    noise = 0.0005 * np.random.default_rng(3).standard_normal(t.size)
+    history = History("h", command(t) + noise, command(t), 2000.0)
+    found = list(model_quality._alike_loops([history]))
+    assert len(found) == one_amplitude + one_frequency
+    assert any(" Hz" in text for text in found) == one_frequency
+
+
+def test_one_frequency_or_amplitude_is_good_for_a_ppi_at_most():
+    time_s = np.arange(4000) / 1000.0
+    for command in (np.sin(10.0 * time_s), np.sin(10.0 * time_s) * (3.0 - 0.5 * time_s)):
+        displacement_um = TRUTH.forward(1000.0).process(5.0 * command)
+        history = History("sine", 5.0 * command, displacement_um, 1000.0)
+        assert judged([history], plays=6).verdict.grade == "good"
+        for kind in ("rdpi", "integrated"):
+            settings = FitSettings(kind=kind, plays=4, starts=1, weight_by="equal")
+            verdict = identify_records(FitRequest([history], settings, "A")).verdict
+            assert verdict.grade != "good"
+            assert any("at other frequencies" in note for note in verdict.notes)

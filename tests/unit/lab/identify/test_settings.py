@@ -1,0 +1,81 @@
+"""The settings of a fit: defaults of each kind, what belongs to which, and what is reported."""
+
+from typing import get_args
+
+import pytest
+from pydantic import ValidationError
+
+from hilctl.lab.identify.registry import CATALOGUE
+from hilctl.lab.identify.settings import (
+    PUBLISHED,
+    FitKind,
+    FitSettings,
+    IdentifySettings,
+    kinds_of,
+    setting_rows,
+)
+
+
+def test_every_kind_has_an_entry_and_known_settings():
+    assert set(CATALOGUE) == set(get_args(FitKind))
+    assert set(PUBLISHED) <= set(CATALOGUE)
+    for field in FitSettings.model_fields.values():
+        assert set(kinds_of(field)) <= set(CATALOGUE)
+    for kind in CATALOGUE:
+        assert FitSettings(kind=kind).changes() == ""
+
+
+def test_published_choices_of_a_kind_are_its_defaults():
+    """Sections 3.4.2, 5.3 and 6.4."""
+    assert FitSettings(kind="ppi").plays == 10
+    rdpi = FitSettings(kind="rdpi")
+    assert (rdpi.plays, rdpi.weights, rdpi.weight_by, rdpi.points) == (4, "free", "hysteresis", 400)
+    omega = FitSettings()
+    assert (omega.plays, omega.deadbands, omega.weights) == (12, 8, "exponential")
+    assert FitSettings(kind="rdpi", plays=6).plays == 6
+
+
+def test_staged_models_have_their_stages_unless_left_out():
+    full = FitSettings(kind="staged")
+    assert (full.lag, full.structure, full.delay) == ("growth", True, True)
+    less = FitSettings(kind="staged", lag="none", structure=False, delay=False)
+    assert less.changes() == "lag=none, structure=false, delay=false"
+
+
+@pytest.mark.parametrize(("choices", "reason"), [
+    ({"kind": "integrated", "lag": "plain"}, "not of integrated"),
+    ({"kind": "ppi", "deadbands": 8}, "not of ppi"),
+    ({"kind": "integrated", "deadbands": 0}, "greater than or equal to 1"),
+    ({"kind": "staged", "weights": "exponential"}, "not of staged"),
+    ({"kind": "staged", "creep": True}, "not of staged"),
+    ({"kind": "staged", "hysteresis": "preisach", "lag": "none"}, "needs a lag"),
+    ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "deadbands"),
+    ({"kind": "kp", "plays": "auto"}, "not of kp"),
+])  # fmt: skip
+def test_impossible_choices_are_refused(choices, reason):
+    with pytest.raises(ValidationError, match=reason):
+        FitSettings(**choices)
+
+
+def test_auto_is_a_size_and_a_lag():
+    settings = IdentifySettings(kind="ppi", plays="auto", table={"lag_samples": "auto"})  # type: ignore[arg-type]
+    assert settings.size == "auto"
+    assert settings.plays == 10
+    assert settings.table.find_lag
+    assert settings.changes() == "size=auto, table.find_lag=true"
+
+
+def test_the_unit_is_that_of_the_recordings():
+    assert IdentifySettings(kind="ppi").unit("A") == "A"
+    assert IdentifySettings(kind="ppi").unit(None) == "V"
+    assert IdentifySettings(kind="rdpi").unit(None) == "A"
+
+
+def test_rows_have_defaults_limits_and_kinds():
+    rows = {name: rest for name, *rest in setting_rows()}
+    assert rows["plays"][0].startswith("12, 10 for ppi")
+    assert rows["plays"][1] == "1 to 200"
+    assert rows["weights"][1] == "exponential, free"
+    assert rows["turning_um"][:2] == ["-", ""]
+    assert rows["lag"][2] == "staged"
+    assert "table.time_column" in rows

@@ -1,0 +1,168 @@
+"""Learning over runs that a test makes: what stops it, and what then stands."""
+
+import json
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from hilctl.analysis.report import summarize
+from hilctl.base.errors import ConfigError, InputError, RunError
+from hilctl.base.segments import Segment
+from hilctl.experiment.correction import Correction, LearnedCycle, load_correction
+from hilctl.lab.ilc.cycle import CycleScore
+from hilctl.lab.ilc.ilc_session import (
+    HIGHEST_PART,
+    IlcResult,
+    IlcSession,
+    beginning,
+    repeating,
+    row_of,
+)
+from hilctl.lab.ilc.update import IlcState
+from hilctl.recording.reader import read
+from hilctl.run.result import RunResult
+from hilctl.run.start import checked_experiment, unpaced
+
+SINE = Path(__file__).parents[4] / "configs" / "terfenol_sine_6a.yaml"
+SETTINGS = ["waveform.frequency_hz=250", "waveform.duration_s=0.4681", "device.seed=40"]
+
+
+class Runs:
+    """Runs for real up to one that ends otherwise; keeps what each was set to."""
+
+    def __init__(self, last=99, code="fault", stop_signal=0):
+        self.last, self.code, self.stop_signal = last, code, stop_signal
+        self.settings = []
+
+    def __call__(self, path, settings, output):
+        self.settings.append(settings)
+        if len(self.settings) <= self.last:
+            return unpaced(path, settings, output)
+        unpaced(path, settings, output)
+        return RunResult(output, self.code, "by a test", "confirmed", self.stop_signal, 0, 0, 0)
+
+
+def learned(folder, runs, cycles=2):
+    return IlcSession(SINE, SETTINGS, folder, runs).learn(cycles, lambda rows: None)
+
+
+@pytest.mark.slow
+def test_each_run_has_the_next_correction_and_noise_of_its_own(tmp_path):
+    runs, folder = Runs(), tmp_path / "lab #3: ü"  # of a name that has a meaning in YAML
+    found = learned(folder, runs)
+    assert len(runs.settings) == 4
+    for number, settings in enumerate(runs.settings):
+        file = folder / f"run-{number:02d}.yaml"
+        assert settings[-2:] == [f'compensator.correction="{file}"', f"device.seed={40 + number}"]
+        assert load_correction(file).sample_rate_hz == found.correction.sample_rate_hz
+    assert [row.run for row in found.rows] == [0, 1, 2]
+    assert [row.run for row in found.check] == [3]
+    assert "2 learning cycles" in found.reason
+    assert found.rows[1].error_percent < found.rows[0].error_percent
+
+
+@pytest.mark.parametrize("before", [
+    "condition={cycles: 3, frequency_hz: 50, rest_s: 0.0123}",
+    "compensator.offset=measured",
+    "device.output_at_open=3.3",
+])  # fmt: skip
+def test_samples_before_the_waveform_are_not_evaluated(tmp_path, before):
+    settings = [*SETTINGS, before]
+    (row,) = IlcSession(SINE, settings, tmp_path, Runs(1)).learn(1, lambda rows: None).rows
+    report = summarize(read(Path(row.recording)))
+    assert row.error_percent == pytest.approx(report.peak_error_percent)
+
+
+def test_a_run_that_is_stopped_leaves_what_was_learned(tmp_path):
+    found = learned(tmp_path, Runs(1, "stopped", 15))
+    assert (found.stop_signal, found.fault, found.check) == (15, False, ())
+    assert len(found.rows) == 1
+    assert "run 1: " in found.reason
+
+
+def test_a_fault_is_one_and_leaves_what_was_learned(tmp_path):
+    found = learned(tmp_path, Runs(1))
+    assert (found.stop_signal, found.fault) == (0, True)
+
+
+def test_a_run_that_a_stall_ends_is_repeated(tmp_path):
+    lost = []
+
+    def run(path, settings, output):
+        fault = [] if lost else ['device.fault={"kind": "sensor_nan", "at_sample": 2000}']
+        result = unpaced(path, [*settings, *fault], output)
+        lost.extend(event.code for event in read(output).events if fault)
+        return result
+
+    found = learned(tmp_path, run, cycles=0)
+    assert ("sensor_invalid" in lost, found.fault) == (True, False)
+    assert [row.run for row in found.rows] == [0]
+
+
+def test_a_first_run_that_fails_is_an_error(tmp_path):
+    with pytest.raises(RunError, match="run 0: "):
+        learned(tmp_path, Runs(0))
+
+
+def test_a_folder_that_can_not_be_made_is_said_before_a_run(tmp_path):
+    (tmp_path / "file").touch()
+    runs = Runs()
+    with pytest.raises(InputError, match="cannot create"):
+        learned(tmp_path / "file" / "runs", runs)
+    assert runs.settings == []
+
+
+CONFIGS = Path(__file__).parents[4] / "configs"
+SINE_repeating = CONFIGS / "terfenol_sine_6a.yaml"
+
+
+def test_a_sine_is_learned_from_nothing():
+    checked = checked_experiment(SINE_repeating, [])
+    (segment,) = repeating(checked)
+    state = beginning(checked, segment)
+    assert state.highest_hz == HIGHEST_PART * checked.reference.sample_rate_hz
+    assert not np.any(state.next_um)
+
+
+def test_without_a_compensator_there_is_no_input_to_correct():
+    checked = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
+    with pytest.raises(ConfigError, match="compensator: "):
+        repeating(checked)
+
+
+def test_a_single_cycle_does_not_repeat():
+    short = ["waveform.frequency_hz=10", "waveform.duration_s=0.5"]
+    with pytest.raises(ConfigError, match="2 whole cycles"):
+        repeating(checked_experiment(SINE_repeating, short))
+
+
+RATE_HZ = 10_000.0
+SEGMENT = Segment("sine", 0, 5000, 0, 5000, 100.0)
+ERROR = CycleScore(
+    harmonics_um=np.zeros(4, dtype=complex), noise_um=np.zeros(4), step_hz=100.0, cycles=16,
+    peak_um=2.0, rms_um=0.5, peak_to_peak_um=50.0, floor_um=0.1, strongest_hz=100.0,
+    answer=1.0 + 0.0j,
+)  # fmt: skip
+STATE = IlcState(RATE_HZ, 1250.0, np.zeros(4, dtype=complex))
+ROW = row_of(3, SEGMENT, ERROR, STATE, 800.0, Path("run-03.mcap"))
+
+
+def test_a_row_is_in_percent_of_the_peak_to_peak_displacement():
+    assert (ROW.run, ROW.label, ROW.cycles, ROW.recording) == (3, "sine", 16, "run-03.mcap")
+    assert ROW.rms_percent == pytest.approx(1.0)
+    assert ROW.error_percent == pytest.approx(4.0)
+    assert ROW.delay_samples == pytest.approx(STATE.response.delay_s * RATE_HZ)
+
+
+def test_programs_get_figures_without_coefficients():
+    cycle = LearnedCycle.from_coefficients(
+        "sine", 100.0, np.zeros(64), np.ones(50, dtype=complex), start_percent=4.0,
+        error_percent=0.5,
+    )  # fmt: skip
+    correction = Correction(sample_rate_hz=RATE_HZ, model_sha256="0" * 64, cycles=(cycle,))
+    mapping = IlcResult(correction, (ROW, ROW), (ROW,), "done").to_mapping()
+    text = json.dumps(mapping, allow_nan=False)
+    assert "cosine" not in text
+    assert mapping["waveforms"] == [{"label": "sine", "start_percent": 4.0, "error_percent": 0.5}]
+    assert mapping["reason"] == "done"

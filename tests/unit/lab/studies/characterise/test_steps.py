@@ -1,0 +1,111 @@
+"""Steps on a formula as the actuator, and every problem of the rig."""
+
+import numpy as np
+import pytest
+
+from hilctl.lab.studies.characterise.measurements import RigProblemError
+from hilctl.lab.studies.characterise.results import Measured
+from hilctl.lab.studies.characterise.steps import STEPS, full_amplitude
+from tests.unit.lab.studies.characterise.conftest import plays
+from tests.unit.lab.studies.characterise.test_measurements import resonator
+
+
+@pytest.fixture
+def walked(played):
+    """Run the steps up to a named one; return measurements and step names."""
+
+    def walk(limits, actuator=plays, noise_um=0.01, last="", changed=None):
+        measured, names = Measured(), []
+        for number, step in enumerate(STEPS):
+            keys = step.waveform(limits, measured)
+            if keys is None:
+                continue
+            names.append(step.name)
+            moves = (changed or {}).get(step.name, actuator)
+            recording = played(limits, keys, moves, noise_um, seed=number)
+            measured, text = step.take(recording, limits, measured)
+            assert text
+            if step.name == last:
+                break
+        return measured, names
+
+    return walk
+
+
+def problem_of(walked, limits, *arguments, **more):
+    with pytest.raises(RigProblemError) as caught:
+        walked(limits, *arguments, **more)
+    return caught.value
+
+
+def test_a_sound_actuator_goes_through_all_steps(walked, limits):
+    """A reaction at 1 % of the range skips the other polarity steps."""
+    measured, names = walked(limits)
+    assert names == [
+        "rest", "polarity-1", "response-1", *(f"growing-{k}" for k in range(1, 6)), "slow-loops",
+        "fast-loops", "reversal-curves", "biased-loops", "creep", "small-motions",
+        "settled-loops", "training", "held-out", "repeated",
+    ]  # fmt: skip
+    assert measured.reaction.amplitude == pytest.approx(0.01 * limits.reach, rel=1e-3)
+    amplitudes = [each.amplitude for each in measured.growing]
+    assert amplitudes == pytest.approx(
+        [part * limits.reach for part in (0.1, 0.25, 0.5, 0.75, 1.0)], rel=1e-2
+    )
+    assert measured.repeated.shape_percent < 0.5
+    assert len(measured.fast) > 8
+    assert measured.reversal.return_percent < 0.5
+    assert measured.crept_percent == pytest.approx((0.0, 0.0), abs=0.01)
+
+
+def test_the_stroke_holds_amplitudes_down(walked, limits_with):
+    limits = limits_with("limits.stroke_um=[-20.0, 20.0]")
+    measured, _ = walked(limits)
+    reached = max(each.high_um for each in (*measured.growing, *measured.slow, *measured.fast))
+    assert 15.0 < reached < 20.0
+    assert full_amplitude(limits, measured) < 0.9 * limits.reach
+
+
+@pytest.mark.slow
+def test_a_faint_reaction_is_asked_for_again(walked, limits):
+    measured, names = walked(limits, lambda v: 0.2 * v, noise_um=0.15, last="response-2")
+    assert names == ["rest", "polarity-1", "polarity-2", "response-1", "response-2"]
+    assert measured.small.gain_um == pytest.approx(0.2, rel=0.1)
+
+
+@pytest.mark.parametrize(("actuator", "noise_um", "code", "said"), [
+    (lambda v: 0.0 * v, 0.01, "no_reaction", "10 % of the range"),
+    (lambda v: -plays(v), 0.01, "wrong_polarity", "at 1 %"),
+    (lambda v: 2.0 * v**2, 0.01, "no_bias", "--model butterfly"),
+    (lambda v: 0.01 * v, 20.0, "noise", "rms"),
+    (lambda v: np.minimum(plays(v), 12.0), 0.0, "saturated_sensor", "12 µm"),
+], ids=["dead coil", "swapped wires", "no bias", "noise", "sensor ends early"])  # fmt: skip
+def test_problems_of_the_rig(walked, limits, actuator, noise_um, code, said):
+    error = problem_of(walked, limits, actuator, noise_um=noise_um)
+    assert error.code == code
+    assert said in str(error)
+
+
+def test_noise_that_leaves_no_loop(walked, limits):
+    """An average shows the motion, but a loop of 1.5 um is hidden by 0.4 um rms."""
+    error = problem_of(walked, limits, lambda v: 0.2 * v, noise_um=0.45)
+    assert error.code in {"noise", "not_repeatable"}
+
+
+@pytest.mark.slow
+def test_a_resonance_in_the_band(walked, limits, limits_with):
+    structure = resonator(45.0, 0.05)
+    error = problem_of(walked, limits, lambda v: 4.0 * structure(v))
+    assert error.code == "resonance"
+    assert "--highest-hz 15 " in str(error)
+    measured, _ = walked(
+        limits_with(highest_hz=15.0), lambda v: 4.0 * structure(v), last="response-1"
+    )
+    assert measured.small.natural_hz == pytest.approx(45.0, rel=0.05)
+
+
+@pytest.mark.parametrize(("step", "actuator"), [
+    pytest.param("repeated", lambda v: plays(v, 1.3), marks=pytest.mark.slow),
+    ("growing-5", lambda v: plays(v) + 10.0 * (np.arange(v.size) > 0.6 * v.size)),
+])  # fmt: skip
+def test_an_actuator_that_changes(walked, limits, step, actuator):
+    assert problem_of(walked, limits, changed={step: actuator}).code == "not_repeatable"
