@@ -19,8 +19,15 @@ from urllib.parse import quote
 import numpy as np
 
 from hilctl.analysis.catalogue import Entry, read_catalogue
-from hilctl.analysis.export_files import FORMATS, ColumnFile, Columns, Facts, ParquetFile, arrow
-from hilctl.base.errors import DataError, InputError
+from hilctl.analysis.export_files import (
+    ColumnFile,
+    Columns,
+    Facts,
+    ParquetFile,
+    arrow,
+    file_class,
+)
+from hilctl.base.errors import DataError
 from hilctl.base.files import check_writable, make_folder, write_file
 from hilctl.base.samples import COLUMNS, RECORDED_FIELDS, RecordedField
 from hilctl.base.types import F64
@@ -57,10 +64,7 @@ def export(
             samples, or pyarrow is missing.
         DataError: There is no sample.
     """
-    begin = FORMATS.get(path.suffix.lower())
-    if begin is None:
-        known = ", ".join(FORMATS)
-        raise InputError(f"{path}: the suffix must be one of {known}: got {path.suffix!r}")
+    begin = file_class(path)
     check_writable(path, overwrite=overwrite)
     pieces = [recording] if isinstance(recording, Recording) else recording
     rows = 0

@@ -1,17 +1,18 @@
-"""Writers of column files: CSV, NumPy, Parquet, MATLAB.
+"""Writers of column files: CSV, NumPy, Parquet.
 
 They keep one piece in memory. For formats that need whole columns, those are collected in temporary
 files.
 """
 
 from base64 import b64encode
-from collections.abc import Callable, Mapping
+from collections.abc import Mapping
 from pathlib import Path
 from typing import Any, BinaryIO, Protocol, TypeAlias
 
 import numpy as np
 
 from hilctl.base.errors import InputError
+from hilctl.base.plugins import EXPORT_FORMATS, registered
 
 Columns: TypeAlias = Mapping[str, Any]
 Facts: TypeAlias = Mapping[str, str]
@@ -20,11 +21,13 @@ _CSV_ROWS = 20_000
 _GROUP_ROWS = 2**20  # as pyarrow has it
 _BATCH_ROWS = 2**16  # encoded together; a page has as many or twice that
 _WRITTEN_BYTES = 2**21  # per write: Arrow waits for the interpreter at each one
-_LARGEST_MAT_BYTES = 2**31 - 1  # per variable in this version of the format
 
 
 class ColumnFile(Protocol):
     """A file being written."""
+
+    def __init__(self, stream: BinaryIO, aside: Path) -> None:
+        """Write to ``stream``; ``aside`` is a folder for temporary files."""
 
     def add(self, columns: Columns) -> None:
         """Write more rows; raise InputError if the format cannot hold them."""
@@ -161,13 +164,13 @@ class ParquetFile:
         )
 
 
-class _StoredColumns:
+class StoredColumns:
     """Columns in one file each of the folder ``aside``."""
 
     def __init__(self, stream: BinaryIO, aside: Path) -> None:
-        self._stream, self._aside = stream, aside
+        self.stream, self._aside = stream, aside
         self._kinds: dict[str, np.dtype[Any]] = {}
-        self._rows = 0
+        self.rows = 0
 
     def add(self, columns: Columns) -> None:
         """Store rows."""
@@ -175,41 +178,21 @@ class _StoredColumns:
             self._kinds[name] = values.dtype
             with (self._aside / name).open("ab") as file:
                 file.write(np.ascontiguousarray(values).data)  # tofile() hides the errno
-        self._rows += next(iter(columns.values())).size
+        self.rows += next(iter(columns.values())).size
 
-    def _joined(self) -> dict[str, Any]:
+    def joined(self) -> dict[str, Any]:
         """Return the columns, mapped."""
         kinds = self._kinds.items()
         return {name: np.memmap(self._aside / name, kind, "r") for name, kind in kinds}
 
 
-class NpzFile(_StoredColumns):
+class NpzFile(StoredColumns):
     """NumPy archive of columns, and of facts as texts."""
 
     def finish(self, facts: Facts) -> None:
         """Write the archive."""
-        arrays: dict[str, Any] = {**self._joined(), **facts}
-        np.savez(self._stream, **arrays)
-
-
-class MatFile(_StoredColumns):
-    """MATLAB 5 file of column vectors, and of facts as texts."""
-
-    def add(self, columns: Columns) -> None:
-        """Store rows."""
-        super().add(columns)
-        if 8 * self._rows > _LARGEST_MAT_BYTES:
-            most = _LARGEST_MAT_BYTES // 8
-            raise InputError(
-                f".mat holds at most {most} samples: export a stretch (--from, --to) or .parquet"
-            )
-
-    def finish(self, facts: Facts) -> None:
-        """Write the file; each column is copied to memory in turn."""
-        from scipy.io import savemat
-
-        stream: Any = self._stream  # the stubs know only paths
-        savemat(stream, {**self._joined(), **facts}, oned_as="column")
+        arrays: dict[str, Any] = {**self.joined(), **facts}
+        np.savez(self.stream, **arrays)
 
 
 def arrow() -> Any:
@@ -223,10 +206,21 @@ def arrow() -> Any:
     return pa
 
 
-FORMATS: dict[str, Callable[[BinaryIO, Path], ColumnFile]] = {
+_FORMATS: dict[str, type[ColumnFile]] = {
     ".csv": CsvFile,
     ".npz": NpzFile,
     ".parquet": ParquetFile,
-    ".mat": MatFile,
 }
-"""Writer per suffix."""
+
+
+def file_class(path: Path) -> type[ColumnFile]:
+    """Return the writer of a path's suffix; raise InputError if there is none."""
+    suffix = path.suffix.lower()
+    added = {f".{name}": point for name, point in registered(EXPORT_FORMATS).items()}
+    if suffix in _FORMATS:
+        return _FORMATS[suffix]
+    if suffix in added:
+        loaded: type[ColumnFile] = added[suffix].load()
+        return loaded
+    known = ", ".join([*_FORMATS, *added])
+    raise InputError(f"{path}: the suffix must be one of {known}: got {path.suffix!r}")

@@ -1,4 +1,4 @@
-"""Tables of numbers in text, NumPy, MATLAB and Parquet files; errors name file and line.
+"""Tables of numbers in text, NumPy and Parquet files; errors name file and line.
 
 Encoding, separator, decimal mark, preamble, names and units of a text table are found in the text:
 
@@ -18,7 +18,7 @@ import re
 from abc import ABC, abstractmethod
 from array import array
 from collections import Counter
-from collections.abc import Collection, Iterator, Sequence
+from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
@@ -30,6 +30,7 @@ import numpy.typing as npt
 
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import no_such_file, read_bytes
+from hilctl.base.plugins import TABLE_READERS, registered
 from hilctl.base.types import F64, I64
 
 _log = logging.getLogger(__name__)
@@ -488,7 +489,7 @@ _Columns = dict[str, npt.NDArray[Any]]
 
 
 def open_table(path: Path, skip_rows: int = 0) -> Table:
-    """Open a table: ``.npy``, ``.npz``, ``.mat``, ``.parquet``, or text.
+    """Open a table: ``.npy``, ``.npz``, ``.parquet``, a registered suffix, or text.
 
     ``skip_rows`` is the number of lines to skip at the start of a text table.
 
@@ -496,9 +497,13 @@ def open_table(path: Path, skip_rows: int = 0) -> Table:
         InputError: The file cannot be read, or holds no columns of numbers.
         DataError: A text table has no rows of numbers.
     """
-    read = _READERS.get(path.suffix.lower())
+    suffix = path.suffix.lower()
+    read = _READERS.get(suffix)
     if read is None:
-        return TextTable(path, skip_rows)
+        added = registered(TABLE_READERS).get(suffix.removeprefix("."))
+        if added is None:
+            return TextTable(path, skip_rows)
+        read = added.load()
     if not path.is_file():
         raise InputError(no_such_file(path))
     columns = {
@@ -539,38 +544,6 @@ def _npz(path: Path) -> _Columns:
         raise InputError(f"{path}: is not a complete NumPy archive (.npz) of arrays") from None
 
 
-def _mat(path: Path) -> _Columns:
-    from scipy.io import loadmat
-
-    try:
-        stored = loadmat(path, simplify_cells=True)
-    except NotImplementedError:
-        rule = "is of MATLAB 7.3, which is not read: save it with -v7, or as .csv or .parquet"
-        raise InputError(f"{path}: {rule}") from None
-    except Exception as error:  # noqa: BLE001  SciPy raises errors of many kinds on damaged files
-        raise InputError(f"{path}: is not a MATLAB file (.mat): {error}") from None
-    return dict(_arrays("", stored))
-
-
-def _arrays(path: str, value: Any) -> Iterator[tuple[str, npt.NDArray[Any]]]:
-    """Yield the arrays of nested structures by their paths.
-
-    ControlDesk of dSPACE stores a signal as Data, with its Name and Unit in the same structure.
-    """
-    if isinstance(value, dict):
-        texts = (value.get(key) for key in ("Name", "Unit"))
-        name, unit = (text if isinstance(text, str) else "" for text in texts)
-        title = f"{name} [{unit}]" if name and unit else name
-        for key, each in value.items():
-            below = title if title and key == "Data" else f"{path}.{key}".lstrip(".")
-            yield from _arrays(below, each)
-    elif isinstance(value, list) or (isinstance(value, np.ndarray) and value.dtype == object):
-        for each in value:
-            yield from _arrays(path, each)
-    elif isinstance(value, np.ndarray):
-        yield path, value
-
-
 def _parquet(path: Path) -> _Columns:
     try:
         from pyarrow import ArrowInvalid, parquet
@@ -586,4 +559,4 @@ def _parquet(path: Path) -> _Columns:
     return {name: table[name].to_numpy() for name in table.column_names}
 
 
-_READERS = {".npy": _npy, ".npz": _npz, ".mat": _mat, ".parquet": _parquet}
+_READERS = {".npy": _npy, ".npz": _npz, ".parquet": _parquet}

@@ -14,6 +14,7 @@ from hilctl.base.files import no_such_file, reason
 from hilctl.base.segments import SHORTEST_PERIOD, Segment
 from hilctl.base.table import ArrayTable, RowError, Table, open_table
 from hilctl.base.types import CHUNK, F64, chunks
+from hilctl.kernels.spline import cubic_spline
 from hilctl.waveforms import shapes, spec
 
 _RATE_TOLERANCE = 1e-6
@@ -74,9 +75,9 @@ def _resampled(
     t = np.arange(n) / sample_rate_hz
     if w.resample == "linear":
         return np.interp(t, t_file, raw)
-    from scipy.interpolate import CubicSpline
-
-    return np.asarray(CubicSpline(t_file, raw)(t), dtype=np.float64)
+    found = np.empty(n)
+    cubic_spline(raw, t * rate_hz, np.empty(raw.size), np.empty(raw.size), found)
+    return found
 
 
 def _read(w: spec.FileWaveform, path: Path) -> tuple[F64, float | None]:

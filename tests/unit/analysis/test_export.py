@@ -187,7 +187,7 @@ def test_existing_file_is_kept_unless_told(tmp_path: Path) -> None:
 def test_full_disk_leaves_the_old_file_and_nothing_else(tmp_path: Path, monkeypatch) -> None:
 
     def full(file: NpzFile, _facts: dict[str, str]) -> None:
-        file._stream.write(b"half of it")
+        file.stream.write(b"half of it")
         raise OSError(errno.ENOSPC, "No space left on device")
 
     monkeypatch.setattr(NpzFile, "finish", full)

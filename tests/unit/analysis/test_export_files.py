@@ -13,8 +13,7 @@ import pytest
 from pyarrow import parquet
 
 from hilctl.analysis import export_files
-from hilctl.analysis.export_files import CsvFile, MatFile, ParquetFile
-from hilctl.base.errors import InputError
+from hilctl.analysis.export_files import CsvFile, ParquetFile
 
 FACTS = {"run": json.dumps({"name": "x"}), "model_yaml": "", "experiment_yaml": "name: \u03bc\n"}
 
@@ -49,15 +48,6 @@ def test_csv_in_pieces_is_that_of_the_whole(tmp_path):
     one = written(CsvFile, tmp_path / "a" / "x.csv", PARTS).read_bytes()
     assert one == written(CsvFile, tmp_path / "b" / "x.csv", [WHOLE]).read_bytes()
     assert one.startswith(b"sample,t_s,reference_um,a,flags\n0,0.0,nan,nan,0\n")
-
-
-def test_mat_says_what_it_can_not_hold(tmp_path, monkeypatch):
-    monkeypatch.setattr(export_files, "_LARGEST_MAT_BYTES", 8 * 1000)
-    with (tmp_path / "x.mat").open("xb") as stream:
-        file = MatFile(stream, tmp_path)
-        file.add(columns(0, 1000))
-        with pytest.raises(InputError, match=r"1000 samples"):
-            file.add(columns(1000, 1001))
 
 
 @pytest.mark.parametrize("rows", [1000, 30_000, 10**9])

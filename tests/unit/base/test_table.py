@@ -106,18 +106,6 @@ def test_arrays_of_other_programs(tmp_path, suffix):
         open_table(path)
 
 
-def test_signals_in_structures(tmp_path):
-    """The time of ControlDesk is one structure, its signals are an array of them."""
-    signals = [{"Name": "Model/AO", "Data": [1.0, 2.0, 3.0], "Unit": "V"},
-               {"Name": "Model/Gap", "Data": [[4.0, 5.0, 6.0]], "Unit": ""}]  # fmt: skip
-    stored = {"rec": {"X": {"Data": [0.0, 0.1, 0.2]}, "Y": signals, "Capture": {"Length": 3.0}}}
-    pytest.importorskip("scipy.io").savemat(tmp_path / "rec.mat", stored)
-    table = open_table(tmp_path / "rec.mat")
-    assert table.names == ["rec.X.Data", "Model/AO [V]", "Model/Gap"]
-    expected = [[0.0, 0.1, 0.2], [1.0, 2.0, 3.0], [4.0, 5.0, 6.0]]
-    np.testing.assert_array_equal(table.read([0, 1, 2]).values, expected)
-
-
 SEPARATORS = {"comma": ",", "comma and blank": ", ", "semicolon": ";", "tab": "\t", "blanks": "   "}
 
 
