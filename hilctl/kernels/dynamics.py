@@ -61,7 +61,7 @@ def lag_block(v: F64, periods: float, growth: float, memory: F64, out: F64) -> N
     for k in range(v.size):
         now, held, x = v[k], memory[1], memory[0]
         behind = abs(held - x)
-        if not abs(held) >= 0.0:
+        if math.isnan(held):
             x = now
         elif behind > 0.0:
             x = held - math.copysign(_left_behind(behind, growth, periods), held - x)
@@ -82,7 +82,7 @@ def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> 
     furthest = _REACH * periods / growth if growth > 0.0 else math.inf
     for k in range(x.size):
         wanted, there = x[k], memory[0]
-        if not abs(memory[1]) >= 0.0:
+        if math.isnan(memory[1]):
             there = wanted
         way = wanted - there
         size = min(abs(way), furthest)
@@ -99,7 +99,7 @@ def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> 
 def _oldest(memory: F64, now: float) -> float:
     """Append ``now`` to a queue of values, and return the oldest one, which leaves it."""
     last = memory.size - 1
-    if not abs(memory[last]) >= 0.0:
+    if math.isnan(memory[last]):
         for i in range(last):
             memory[i] = now
     left = memory[0] if last else now
@@ -138,7 +138,7 @@ def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
     """
     for k in range(x.size):
         now, before = x[k], memory[0]
-        if not abs(before) >= 0.0:
+        if math.isnan(before):
             before = now
         memory[0] = now
         out[k] = before + part * (now - before)

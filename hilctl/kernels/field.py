@@ -469,7 +469,7 @@ def _advance(
 ) -> float:
     """Advance by a sample with a known output or command, and return the other of the two."""
     k = memory.size - 6
-    fresh = not abs(memory[k + 5]) >= 0.0
+    fresh = math.isnan(memory[k + 5])
     # The first command counts as having stood there for ever: nothing of it is lost.
     given = _FIELD if fresh and what == _COMMAND else what
     u, m = _root(given, target, span, memory, bank, coupling, losses)

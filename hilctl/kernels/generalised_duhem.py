@@ -199,7 +199,7 @@ def _root(command: float, memory: F64, band: Band, losses: Losses) -> float:
 
     Newton's steps within the bounds from the signs so far; bisection if a step leaves these.
     """
-    fresh = not abs(memory[3]) >= 0.0
+    fresh = math.isnan(memory[3])
     low, high = -math.inf, math.inf
     y = float(memory[0])
     for _ in range(_STEPS):
@@ -233,7 +233,7 @@ def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> 
         if abs(v[k]) < math.inf:
             y = _root(v[k], memory, band, losses)
             w, z, _, _ = _moved(y, memory, band, losses)
-            memory[2] = z if abs(memory[3]) >= 0.0 else 0.0
+            memory[2] = 0.0 if math.isnan(memory[3]) else z
             memory[0], memory[1], memory[3] = y, w, v[k]
             out[k] = y
         else:
@@ -246,7 +246,7 @@ def duhem_inverse(y: F64, band: Band, losses: Losses, memory: F64, out: F64) -> 
     for k in range(y.size):
         if abs(y[k]) < math.inf:
             w, z, command, _ = _moved(y[k], memory, band, losses)
-            if not abs(memory[3]) >= 0.0:  # it counts as having stood there for ever
+            if math.isnan(memory[3]):  # it counts as having stood there for ever
                 z, command = 0.0, w
             memory[0], memory[1], memory[2], memory[3] = y[k], w, z, y[k]
             out[k] = command

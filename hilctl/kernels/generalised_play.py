@@ -112,7 +112,7 @@ def envelope_inverse(
         z = _sum_of_plays(y[k], plays, memory)
         upper = _inverse_envelope(z, rising)
         lower = min(upper, _inverse_envelope(z, falling))
-        held = memory[m + 1] if abs(memory[m + 1]) >= 0.0 else 0.0
+        held = 0.0 if math.isnan(memory[m + 1]) else memory[m + 1]
         held = upper if z > memory[m] else (lower if z < memory[m] else held)
         now = max(low, min(high, max(lower, min(upper, held))))
         memory[m] = z

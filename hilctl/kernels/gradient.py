@@ -11,6 +11,7 @@ orthogonalised one after the other. So a step or a bound of one does not affect 
 """
 
 import math
+from typing import TypeAlias
 
 from hilctl.base.types import F64, F64_2D, I64, U32
 from hilctl.kernels.jit import kernel
@@ -20,8 +21,22 @@ BOUND, CENTRE, POWER = range(3)  # rows of what belongs to each, see the functio
 MIDDLE_UM, HALF_UM, LARGEST_UM, DEAD_UM2, RATE, SMOOTHING, LEAK, COUNT = range(8)
 SETTINGS = 8
 VALUE, FORM, GRADIENT, FOUND, TOTAL = range(5)  # rows of the state
+Operator: TypeAlias = tuple[F64, F64_2D, F64_2D, F64]
+"""Constants of an operator with m parameters.
 
-_FURTHEST = 4.0  # half spans from the middle: an input beyond is none that the steps are made for
+settings    float64[8], see the names above
+table       float64[3, m]: bound of each parameter, centre of its regressor before it is
+            orthogonalised, and mean square after that; infinite if it is not adapted
+shape       float64[m, m], lower triangle: share of the others in each regressor
+thresholds  float64[m - 2], rising, in half spans
+"""
+DelayLines: TypeAlias = tuple[F64, F64, I64]
+"""References (float64[d + 1]) and inputs (float64[e + 1]), and the positions in both (int64[2]).
+
+They delay by the d and e samples from a reference and an input to the displacement that shows it.
+"""
+
+_FURTHEST = 4.0  # half spans from the middle: the steps are not designed for inputs beyond
 
 
 @kernel(inline=True)
@@ -64,21 +79,15 @@ def _played(u: float, thresholds: F64, memory: F64) -> float:
 
 @kernel()
 def adapted_input(
-    input_um: F64,
-    size: int,
-    before: F64,
-    after: F64,
-    settings: F64,
-    table: F64_2D,
-    thresholds: F64,
-    memory: F64,
+    input_um: F64, size: int, before: F64, after: F64, operator: Operator, memory: F64
 ) -> None:
     """Convert requested displacements to a model's input, in place, by the operator's inverse.
 
     Values of ``input_um``, float64[n], that are not finite stay, and move no play. ``before`` and
-    ``after`` ``size`` >= n samples, o, g and w_i are float64[m]; between, they change linearly. See
-    :func:`adapt_block` for the other arguments.
+    ``after`` ``size`` >= n samples, o, g and w_i are float64[m]; between, they change linearly.
+    ``memory`` is float64[m - 1], of the plays.
     """
+    settings, table, _shape, thresholds = operator
     middle, half = settings[MIDDLE_UM], settings[HALF_UM]
     for k in range(input_um.size):
         wanted = input_um[k]
@@ -93,10 +102,9 @@ def adapted_input(
 
 
 @kernel(inline=True)
-def _regressors(
-    x_um: float, settings: F64, table: F64_2D, shape: F64_2D, thresholds: F64, memory: F64, out: F64
-) -> None:
+def _regressors(x_um: float, operator: Operator, memory: F64, out: F64) -> None:
     """Fill ``out`` (float64[m], um) with the regressors of the adapted parameters."""
+    settings, table, shape, thresholds = operator
     half = settings[HALF_UM]
     u = _played((x_um - settings[MIDDLE_UM]) / half, thresholds, memory)
     out[OFFSET] = 1.0
@@ -112,22 +120,14 @@ def _regressors(
 
 @kernel()
 def regressor_sums(
-    input_um: F64,
-    settings: F64,
-    table: F64_2D,
-    shape: F64_2D,
-    thresholds: F64,
-    memory: F64,
-    found: F64,
-    sums: F64,
-    products: F64_2D,
+    input_um: F64, operator: Operator, memory: F64, found: F64, sums: F64, products: F64_2D
 ) -> None:
     """Add the regressors of an input to ``sums``, float64[m], and their products to ``products``.
 
-    ``found`` is scratch, float64[m]; see :func:`adapt_block` for the other arguments.
+    ``memory`` is float64[m - 1], of the plays; ``found`` is scratch, float64[m].
     """
     for k in range(input_um.size):
-        _regressors(input_um[k], settings, table, shape, thresholds, memory, found)
+        _regressors(input_um[k], operator, memory, found)
         for i in range(found.size):
             sums[i] += found[i]
             for j in range(found.size):
@@ -155,12 +155,13 @@ def _excess(found: F64, table: F64_2D, count: float) -> float:
 
 
 @kernel(inline=True)
-def _step(size: int, settings: F64, table: F64_2D, shape: F64_2D, state: F64_2D) -> None:
+def _step(size: int, operator: Operator, state: F64_2D) -> None:
     """Move the parameters by ``size`` samples of the smoothed gradient, within their bounds.
 
     The dead zone applies to the part of the squared error that a gradient explains: below it, that
     may be noise.
     """
+    settings, table, shape, _thresholds = operator
     pace, dead = size * settings[RATE], settings[DEAD_UM2]
     for j in range(state.shape[1]):
         bound, gradient = table[BOUND, j], state[GRADIENT, j]
@@ -183,60 +184,53 @@ def adapt_block(
     input_um: F64,
     displacement_um: F64,
     flags: U32,
-    settings: F64,
-    table: F64_2D,
-    shape: F64_2D,
-    thresholds: F64,
-    due: F64,
-    shown: F64,
-    places: I64,
+    operator: Operator,
+    lines: DelayLines,
     memory: F64,
     state: F64_2D,
 ) -> int:
     """Compare a block's displacements with the references due, and step the parameters.
 
-    A sample with a larger error than the parameters can cause is ignored, because that is no change
-    of the actuator. A block without any other sample changes nothing.
+    Ignored are samples with a flag, displacements that show the reference or input of such a
+    sample, and errors that are larger than the parameters can cause: they are no change of the
+    actuator. A block without any other sample changes nothing.
 
     Args:
         reference_um: float64[n].
         input_um: float64[n], the model's input.
         displacement_um: float64[n].
-        flags: uint32[n]; samples with a flag are ignored, also where they are shown later.
-        settings: float64[8], see the names above.
-        table: float64[3, m]: bound of each parameter, centre of its regressor before it is
-            orthogonalised, and mean square after that; infinite if it is not adapted.
-        shape: float64[m, m], lower triangle: share of the others in each regressor.
-        thresholds: float64[m - 2], rising, in half spans.
-        due: float64[d + 1], delay line of references, to the displacement that shows them.
-        shown: float64[e + 1], delay line of inputs, to the displacement that shows them.
-        places: int64[2], positions in both lines.
+        flags: uint32[n].
+        operator: Its constants.
+        lines: Delay lines, NaN for samples to ignore.
         memory: float64[m - 1], of the plays.
         state: float64[5, m], parameters, the same as o, g and w_i, smoothed gradient, scratch.
 
     Returns:
         Number of samples used.
     """
+    settings, table = operator[0], operator[1]
+    due, shown, places = lines
     found, total = state[FOUND], state[TOTAL]
-    size, last, taken = reference_um.size, memory.size - 1, 0
+    size, last, used = reference_um.size, memory.size - 1, 0
     total[:] = 0.0
     for k in range(size):
-        # NaN also in the delay lines: what shows a flagged sample later is ignored as well.
-        usable = math.nan if flags[k] else 1.0
-        error = displacement_um[k] * usable - _delayed(reference_um[k] * usable, due, places, 0)
-        x_um = _delayed(input_um[k] * usable, shown, places, 1) + state[VALUE, OFFSET]
-        near = abs(x_um - settings[MIDDLE_UM]) <= _FURTHEST * settings[HALF_UM]
-        good = near and abs(error) <= settings[LARGEST_UM]
-        held_um = settings[MIDDLE_UM] + settings[HALF_UM] * memory[last]
-        _regressors(x_um if near else held_um, settings, table, shape, thresholds, memory, found)
-        if good:  # of what is not, the regressors may be infinite
-            error /= _excess(found, table, settings[COUNT])
+        flagged = flags[k] != 0
+        due_um = _delayed(math.nan if flagged else reference_um[k], due, places, 0)
+        shown_um = _delayed(math.nan if flagged else input_um[k], shown, places, 1)
+        x_um = shown_um + state[VALUE, OFFSET]
+        known = abs(x_um - settings[MIDDLE_UM]) <= _FURTHEST * settings[HALF_UM]  # NaN is not
+        if not known:
+            x_um = settings[MIDDLE_UM] + settings[HALF_UM] * memory[last]  # moves no play
+        _regressors(x_um, operator, memory, found)
+        error_um = displacement_um[k] - due_um
+        if known and not flagged and abs(error_um) <= settings[LARGEST_UM]:
+            error_um /= _excess(found, table, settings[COUNT])
             for j in range(total.size):
-                total[j] += found[j] * error
-        taken += good
-    if taken:
+                total[j] += found[j] * error_um
+            used += 1
+    if used:
         part = size * settings[SMOOTHING] / (1.0 + size * settings[SMOOTHING])
         for j in range(total.size):
             state[GRADIENT, j] += (total[j] / size - state[GRADIENT, j]) * part
-        _step(size, settings, table, shape, state)
-    return taken
+        _step(size, operator, state)
+    return used

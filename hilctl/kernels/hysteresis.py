@@ -12,6 +12,7 @@ Source: "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonli
 Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.
 """
 
+import math
 from typing import TypeAlias
 
 import numpy as np
@@ -135,7 +136,7 @@ def stop_sum(v: F64, direct: float, thresholds: F64, weights: F64, memory: F64, 
     for k in range(v.size):
         now = v[k]
         previous = memory[thresholds.size]
-        if not abs(previous) >= 0.0:
+        if math.isnan(previous):
             previous = 0.0
         for i in range(thresholds.size):
             memory[i] = stop_step(now, previous, thresholds[i], memory[i])

@@ -112,7 +112,7 @@ def _kp(v: float, memory: F64, alpha: F64, beta: F64, weights: F64) -> float:
 
 @kernel()
 def _next_z(v: float, memory: F64, p: F64) -> float:
-    previous = memory[1] if abs(memory[1]) >= 0.0 else 0.0
+    previous = 0.0 if math.isnan(memory[1]) else memory[1]
     return bouc_wen_step(memory[0], v - previous, p[2], p[3], p[4])
 
 
@@ -194,7 +194,7 @@ def _root(
     """Return the command for ``target``, or the nearest end of the span."""
     low, high = span
     held = memory[memory.size - 1]
-    near = max(low, min(high, held if abs(held) >= 0.0 else 0.0))
+    near = max(low, min(high, 0.0 if math.isnan(held) else held))
     near_short = target - _peek(kind, near, memory, arrays)
     if abs(near_short) <= tolerance:
         return near
@@ -227,7 +227,7 @@ def implicit_inverse(
     """
     for k in range(y.size):
         target = y[k]
-        if abs(target) >= 0.0:
+        if not math.isnan(target):
             now = _root(kind, target, span, tolerance, memory, arrays)
             _settle(kind, now, memory, arrays)
             out[k] = now

@@ -84,7 +84,7 @@ def _settle(x: float, given: float, memory: F64, tables: Tables) -> None:
     for i in range(drags):
         kept = math.exp(-abs(change) / lengths[i])
         memory[plays + i] = memory[plays + i] * kept + math.copysign(1.0, change) * (1.0 - kept)
-    if abs(memory[last + 2]) >= 0.0:
+    if not math.isnan(memory[last + 2]):
         for k in range(plays + drags, last):
             memory[k] = memory[k + 1]
         memory[last] = x
@@ -97,7 +97,7 @@ def _settle(x: float, given: float, memory: F64, tables: Tables) -> None:
 @kernel(inline=True)
 def _fastest(memory: F64, tables: Tables) -> float:
     """Return the change that counts as rate 1; infinite at the first sample."""
-    return tables[4][3] if abs(memory[memory.size - 1]) >= 0.0 else math.inf
+    return math.inf if math.isnan(memory[memory.size - 1]) else tables[4][3]
 
 
 @kernel()

@@ -71,6 +71,8 @@ class DisplacementOperator:
     def __init__(self, bounds: F64, settings: F64, table: F64, shape: F64) -> None:
         self.bounds, self.settings, self.table, self.shape = bounds, settings, table, shape
         self.thresholds = np.array(THRESHOLDS)
+        self.constants = settings, table, shape, self.thresholds
+        """What the kernels need of it."""
 
     @classmethod
     def over(
@@ -116,9 +118,7 @@ class DisplacementOperator:
 
     def invert(self, input_um: F64, size: int, before: F64, after: F64, memory: F64) -> None:
         """Convert requested displacements to the model's input, in place."""
-        kernel.adapted_input(
-            input_um, size, before, after, self.settings, self.table, self.thresholds, memory
-        )
+        kernel.adapted_input(input_um, size, before, after, self.constants, memory)
 
     def form(self, values: F64) -> F64:
         """Return o, g and w_i (float64[m]) of adapted parameters."""
@@ -140,10 +140,7 @@ class DisplacementOperator:
             n += part.size
             kernel.regressor_sums(
                 np.array(part),  # a copy: compiled code refuses read-only arrays
-                self.settings,
-                self.table,
-                self.shape,
-                self.thresholds,
+                self.constants,
                 memory,
                 found,
                 sums,
@@ -199,8 +196,8 @@ class Adaptation:
         self._settings[kernel.LEAK] = _LEAK
         self._settings[kernel.COUNT] = max(1, int(np.count_nonzero(operator.bounds)))
         self._averaged = max(1.0, 2.0 / self._settings[kernel.SMOOTHING])
-        self._due, self._shown = np.full(due_after + 1, np.nan), np.full(shown_after + 1, np.nan)
-        self._places = np.zeros(2, dtype=np.int64)
+        due, shown = np.full(due_after + 1, np.nan), np.full(shown_after + 1, np.nan)
+        self._lines = due, shown, np.zeros(2, dtype=np.int64)
         self._state = np.zeros((kernel.TOTAL + 1, m))
         self._before = np.zeros(m)
         self._fed: F64 | None = None
@@ -261,7 +258,8 @@ class Adaptation:
         nor do displacements that show the inputs of such samples.
         """
         if block.skipped:
-            self._due[:] = self._shown[:] = np.nan
+            due, shown, _places = self._lines
+            due[:] = shown[:] = np.nan
         if self._seen is None or not self._ready:
             return
         kernel.adapt_block(
@@ -269,13 +267,8 @@ class Adaptation:
             block.input_um,
             block.displacement_um,
             block.flags,
-            self._settings,
-            self._operator.table,
-            self._operator.shape,
-            self._operator.thresholds,
-            self._due,
-            self._shown,
-            self._places,
+            self._operator.constants,
+            self._lines,
             self._seen,
             self._state,
         )

@@ -146,37 +146,56 @@ class Polarity:
 
     def __init__(self, limit_um: float, shown_after: int) -> None:
         self._limit_um = limit_um
-        self._fewest = shown_after
+        self._shown_after = shown_after
         self._corrections: deque[float] = deque([0.0] * shown_after, shown_after)
-        self._input_um = self._sum_um = (math.inf, -math.inf)
-        self._samples = self._judged_at = 0
+        self._episode = _Episode()
         self.against = ""
 
     def add(self, correction_um: float, due_um: float, displacement_um: float) -> None:
         """Add a sample: correction, reference due, and displacement."""
-        shown_um = self._corrections[0]
+        shown_um = abs(self._corrections[0])
+        input_um = due_um + self._corrections[0]
         self._corrections.append(correction_um)
-        if abs(shown_um) <= 0.5 * self._limit_um:
-            self._input_um = self._sum_um = (math.inf, -math.inf)
-            self._samples = self._judged_at = 0
-        input_um = due_um + shown_um
-        self._input_um = _spanning(self._input_um, input_um)
-        self._sum_um = _spanning(self._sum_um, input_um + displacement_um)
-        self._samples += 1
-        if not self._judged_at and abs(shown_um) >= self._limit_um:
-            self._judged_at = self._samples + max(self._samples, self._fewest)
-        if self._samples == self._judged_at:
-            self._judge()
-
-    def _judge(self) -> None:
-        fed_um = self._input_um[1] - self._input_um[0]
-        left_um = self._sum_um[1] - self._sum_um[0]
-        if left_um <= 0.5 * fed_um:
+        if shown_um <= 0.5 * self._limit_um:
+            self._episode = _Episode()
+        episode = self._episode
+        episode.add(input_um, input_um + displacement_um)
+        if episode.evaluated_after is None and shown_um >= self._limit_um:
+            at_limit = max(episode.samples, self._shown_after)
+            episode.evaluated_after = episode.samples + at_limit
+        if episode.samples == episode.evaluated_after and episode.reversed:
             self.against = (
                 f"the correction and the error grew to the limit of {self._limit_um:g} µm, and "
-                f"input and displacement moved in opposite directions by {fed_um:.3g} µm: the "
-                "sign of the sensor or of the command is wrong"
+                "input and displacement moved in opposite directions by "
+                f"{episode.input_span_um:.3g} µm: the sign of the sensor or of the command is wrong"
             )
+
+
+class _Episode:
+    """Samples since the correction exceeded half of its limit."""
+
+    __slots__ = ("_input_um", "_sum_um", "evaluated_after", "samples")
+
+    def __init__(self) -> None:
+        self._input_um = self._sum_um = (math.inf, -math.inf)
+        self.samples = 0
+        self.evaluated_after: int | None = None
+
+    def add(self, input_um: float, sum_um: float) -> None:
+        """Add a sample: the input, and its sum with the displacement."""
+        self._input_um = _spanning(self._input_um, input_um)
+        self._sum_um = _spanning(self._sum_um, sum_um)
+        self.samples += 1
+
+    @property
+    def input_span_um(self) -> float:
+        """Distance between the smallest and the largest input."""
+        return self._input_um[1] - self._input_um[0]
+
+    @property
+    def reversed(self) -> bool:
+        """Whether the sum moved at most half as far as the input."""
+        return self._sum_um[1] - self._sum_um[0] <= 0.5 * self.input_span_um
 
 
 def _spanning(span: tuple[float, float], value: float) -> tuple[float, float]:

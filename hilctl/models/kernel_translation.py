@@ -28,7 +28,7 @@ Type: TypeAlias = Any
 Value: TypeAlias = tuple[str, Type]
 """Translated expression and its type."""
 
-_MATH = re.compile("atan|atanh|copysign|exp|expm1|floor|log|log1p|sqrt|tan|tanh")
+_MATH = re.compile("atan|atanh|copysign|exp|expm1|floor|isnan|log|log1p|sqrt|tan|tanh")
 RESERVED = re.compile(
     rf"{_MATH.pattern}|abs|array|auto|break|case|catch|char|const|continue|default|do|double|else|"
     "elseif|end|enum|extern|fabs|false|fix|float|for|function|global|goto|if|inline|int|long|main|"

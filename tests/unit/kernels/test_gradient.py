@@ -25,6 +25,10 @@ def table(bound=1.0):
     return np.array([[bound] * 5, centre, [1.0, *[HALF_UM**2] * 4]])
 
 
+def constants():
+    return settings(), table(), np.eye(5), THRESHOLDS
+
+
 def rest():
     return np.zeros(4)
 
@@ -48,7 +52,7 @@ def displaced(input_um, form=FORM):
 def adapted(values, form=FORM, memory=None, size=None):
     out = values.copy()
     memory = rest() if memory is None else memory
-    kernel.adapted_input(out, size or out.size, form, form, settings(), table(), THRESHOLDS, memory)
+    kernel.adapted_input(out, size or out.size, form, form, constants(), memory)
     return out
 
 
@@ -71,7 +75,7 @@ def test_any_cut_gives_the_same_bits():
 def test_parameters_move_in_a_line():
     before, after = np.zeros(5), np.array([1.0, 0.0, 0.0, 0.0, 0.0])
     out = np.full(3, MIDDLE_UM)
-    kernel.adapted_input(out, 4, before, after, settings(), table(), THRESHOLDS, rest())
+    kernel.adapted_input(out, 4, before, after, constants(), rest())
     np.testing.assert_allclose(out, MIDDLE_UM - np.array([0.25, 0.5, 0.75]), atol=1e-12)
 
 
@@ -89,8 +93,8 @@ class Step:
     def __init__(self, due_after=0, shown_after=0, **changed):
         self.settings, self.state = settings(**changed), np.zeros((kernel.TOTAL + 1, 5))
         self.table, self.shape, self.memory = table(), np.eye(5), rest()
-        self.due, self.shown = np.full(due_after + 1, np.nan), np.full(shown_after + 1, np.nan)
-        self.places = np.zeros(2, dtype=np.int64)
+        due, shown = np.full(due_after + 1, np.nan), np.full(shown_after + 1, np.nan)
+        self.lines = due, shown, np.zeros(2, dtype=np.int64)
 
     def take(self, reference, error, flags=None, input_um=None):
         reference = np.asarray(reference, dtype=float)
@@ -101,13 +105,8 @@ class Step:
             input_um,
             reference + error,
             flags,
-            self.settings,
-            self.table,
-            self.shape,
-            THRESHOLDS,
-            self.due,
-            self.shown,
-            self.places,
+            (self.settings, self.table, self.shape, THRESHOLDS),
+            self.lines,
             self.memory,
             self.state,
         )
