@@ -105,20 +105,7 @@ class TableRows:
         """
         time_s: F64 = self.values[time] * factor
         steps = np.diff(time_s)
-        span_s = float(time_s[-1] - time_s[0]) if steps.size else 0.0
-        if span_s > 0.0 and steps.min() == 0.0:
-            many = f"{steps.size / span_s:.4g}"
-            row = int(np.argmin(steps))
-            raise DataError(
-                f"{self.path}:{self.lines[row + 1]}: time repeats: the column has too few digits "
-                f"or a row is there twice; set the sample rate (rate_hz) instead, about {many}"
-            )
-        step = float(np.median(steps)) if steps.size else 0.0
-        if not steps.size:
-            raise DataError(f"{self.path}: holds one row of numbers: needs at least two")
-        if not step > 0.0:
-            rule = "time must rise from row to row"
-            raise DataError(f"{self.path}: {rule}, by {step:g} s as a rule here")
+        step, span_s = self._time_step(time_s, steps)
         counts = np.maximum(np.rint(steps / step), 1.0)
         sample = np.concatenate(([0.0], np.cumsum(counts)))
         wrong = np.abs(steps - counts * step) > tolerance * step
@@ -135,6 +122,24 @@ class TableRows:
                 "Interpolate the table at an even time step"
             )
         return float(sample[-1]) / span_s, sample.astype(np.int64)
+
+    def _time_step(self, time_s: F64, steps: F64) -> tuple[float, float]:
+        """Return the median step and the span, in s, of times that rise."""
+        if not steps.size:
+            raise DataError(f"{self.path}: holds one row of numbers: needs at least two")
+        step, span_s = float(np.median(steps)), float(time_s[-1] - time_s[0])
+        if span_s > 0.0 and steps.min() == 0.0:
+            row = int(np.argmin(steps))
+            raise DataError(
+                f"{self.path}:{self.lines[row + 1]}: time repeats: the column has too few digits "
+                "or a row is there twice; set the sample rate (rate_hz) instead, about "
+                f"{steps.size / span_s:.4g}"
+            )
+        if not step > 0.0:
+            raise DataError(
+                f"{self.path}: time must rise from row to row: the median step is {step:g} s"
+            )
+        return step, span_s
 
 
 class Table(ABC):

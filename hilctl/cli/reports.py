@@ -66,14 +66,7 @@ def report(
     if len(runs) > 1 or is_folder(runs[0]):
         if from_s is not None or to_s is not None or before is not None:
             raise InputError("--from, --to and --before apply to the report of one recording only")
-        with progress_bar("read", quiet=as_json) as on_progress:
-            series = api.report_runs(
-                runs, html, model=model, overwrite=overwrite, on_progress=on_progress
-            )
-        from hilctl.lab.studies.multi_run.multi_run_page import series_mapping  # matplotlib
-
-        values = series_mapping(series)
-        print_result(values, lambda: print_rich(render_series(series)), as_json=as_json)
+        _report_many(runs, html, model, overwrite=overwrite, as_json=as_json)
         return
     if model is not None:
         raise InputError("--model applies to the report of several recordings only")
@@ -87,6 +80,19 @@ def report(
         )
     values = summary.to_mapping()
     print_result(values, lambda: print_rich(render_report(summary)), as_json=as_json)
+
+
+def _report_many(
+    runs: list[Path], html: Path | None, model: Path | None, *, overwrite: bool, as_json: bool
+) -> None:
+    with progress_bar("read", quiet=as_json) as on_progress:
+        series = api.report_runs(
+            runs, html, model=model, overwrite=overwrite, on_progress=on_progress
+        )
+    from hilctl.lab.studies.multi_run.multi_run_page import series_mapping  # matplotlib
+
+    values = series_mapping(series)
+    print_result(values, lambda: print_rich(render_series(series)), as_json=as_json)
 
 
 def replay(

@@ -86,18 +86,10 @@ def run(
     require_linux()
     finish_dead_runs()
     with compile_progress():
-        with ExitStack() as stack:
-            addresses = []
-            if live:
-                from hilctl.live.server_process import served_beside  # websockets
-
-                addresses.append(stack.enter_context(served_beside()))
-            if watch:
-                stack.enter_context(_watched())
-            shown = run_progress(quiet=as_json or watch, addresses=addresses)
+        with _displays(live=live, watch=watch, quiet=as_json or watch) as on_progress:
             result = api.run(
                 experiment, output, settings=settings, overwrite=overwrite, take_over=take_over,
-                on_progress=stack.enter_context(shown),
+                on_progress=on_progress,
             )  # fmt: skip
             if result.stop_signal:  # a second Ctrl-C must not suppress the result
                 signal.signal(result.stop_signal, signal.SIG_IGN)
@@ -108,6 +100,20 @@ def run(
         raise typer.Exit(3)
     if failure or result.stop_signal:
         raise typer.Exit(failure or 128 + result.stop_signal)
+
+
+@contextmanager
+def _displays(*, live: bool, watch: bool, quiet: bool) -> Iterator[Callable[[RunProgress], None]]:
+    """Show a run in its displays meanwhile; yield the function to call with its progress."""
+    with ExitStack() as stack:
+        addresses = []
+        if live:
+            from hilctl.live.server_process import served_beside  # websockets
+
+            addresses.append(stack.enter_context(served_beside()))
+        if watch:
+            stack.enter_context(_watched())
+        yield stack.enter_context(run_progress(quiet=quiet, addresses=addresses))
 
 
 def _report(result: RunResult, *, every: bool) -> tuple[RunReport | None, int]:
@@ -247,6 +253,14 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
 
 def print_forecast(checked: CheckedExperiment) -> None:
     """Print the forecast of a run and its warnings."""
+    terminal = console()
+    terminal.print(listing("", _forecast_rows(checked).items()))
+    for warning in checked.warnings:
+        terminal.print(f"warning: {warning}", style="yellow")
+    terminal.print("ready to run", style="green")
+
+
+def _forecast_rows(checked: CheckedExperiment) -> dict[str, str]:
     forecast, config = checked.forecast, checked.loaded.config
     unit, limits, info = forecast.command_unit, config.limits, checked.loaded.device.info
     low, high = limits.command_range
@@ -273,7 +287,13 @@ def print_forecast(checked: CheckedExperiment) -> None:
         )
     if forecast.begins:
         rows["initial state"] = forecast.begins
-    interlocks = config.interlocks
+    return rows | _supervised_rows(checked)
+
+
+def _supervised_rows(checked: CheckedExperiment) -> dict[str, str]:
+    """Return what interlocks, trigger and device add to the forecast."""
+    forecast, config, rows = checked.forecast, checked.loaded.config, {}
+    info, interlocks = checked.loaded.device.info, config.interlocks
     if interlocks.tracking_error_um is not None:
         more = f"more{for_longer_than(interlocks.tracking_s)} ends the run"
         rows["tracking error"] = f"at most {interlocks.tracking_error_um:g} µm; {more}"
@@ -285,13 +305,10 @@ def print_forecast(checked: CheckedExperiment) -> None:
         rows["safe value"] = info.safe_note
     if forecast.heating_rms_a is not None:
         initial = f"initially {forecast.begins_rms_a or 0.0:.3g} A rms"
-        maximum = f"{forecast.heating_rms_a:.4g} A rms (limit {limits.rms_current_a:g})"
+        limit_a = config.limits.rms_current_a
+        maximum = f"{forecast.heating_rms_a:.4g} A rms (limit {limit_a:g})"
         rows["heating"] = f"{maximum}, {initial}"
-    terminal = console()
-    terminal.print(listing("", rows.items()))
-    for warning in checked.warnings:
-        terminal.print(f"warning: {warning}", style="yellow")
-    terminal.print("ready to run", style="green")
+    return rows
 
 
 def _trigger(checked: CheckedExperiment) -> dict[str, Any] | None:

@@ -5,7 +5,7 @@ valid record to a new file with a new index, statistics and checksums.
 """
 
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from contextlib import closing
+from contextlib import closing, contextmanager
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any, BinaryIO
@@ -230,6 +230,26 @@ def _number(facts: Mapping[str, str], name: str) -> int:
         return 0
 
 
+@contextmanager
+def _named_errors(path: Path, output: Path | None) -> Iterator[None]:
+    try:
+        yield
+    except FileNotFoundError as error:
+        raise DataError(f"{error.filename or path}: no such file or folder") from None
+    except DataError as error:
+        raise DataError(f"{path}: {error}") from None
+    except FileExistsError:
+        raise InputError(f"{output}: exists already: set another --output") from None
+    except OSError as error:
+        where = error.filename or path
+        raise InputError(f"{where}: cannot be recovered: {reason(error)}") from None
+
+
+def _plausible(event: Event) -> bool:
+    """Return whether an event from memory has a possible place and time."""
+    return 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
+
+
 def recover_recording(
     path: Path,
     extra: Iterable[BlockBatch] = (),
@@ -259,37 +279,22 @@ def recover_recording(
             add ``extra``.
         InputError: It is being recorded, or the new file cannot be written. Nothing has changed.
     """
-    try:
-        with open_binary(path) as stream:
-            lock(stream, shared=True)
-            survey = Survey(stream)
-            more = list(_not_in_file(extra, survey.next_sample))
-            events = [  # from memory: implausible ones are omitted
-                event
-                for event in events
-                if 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
-            ]
-            if not survey.scan.repairable and not more:
-                return _left_alone(path, survey)
-            layout = _check(survey, more)
-            with closing(Replacement(path, output)) as replacement:
-                saved = Rewritten(replacement.stream, survey)
-                saved.copy(RecoveryScan(stream, MessageValidator()).records())
-                if layout:
-                    saved.add(more, events, layout)
-                ended = saved.finish(end, ended_at if ended_at < LAST_SAMPLE else 0)
-                if not HAS_LOCKS:
-                    stream.close()
-                kept = replacement.put()
-    except FileNotFoundError as error:
-        raise DataError(f"{error.filename or path}: no such file or folder") from None
-    except DataError as error:
-        raise DataError(f"{path}: {error}") from None
-    except FileExistsError:
-        raise InputError(f"{output}: exists already: give another --output") from None
-    except OSError as error:
-        where = error.filename or path
-        raise InputError(f"{where}: can't be recovered: {reason(error)}") from None
+    with _named_errors(path, output), open_binary(path) as stream:
+        lock(stream, shared=True)
+        survey = Survey(stream)
+        more = list(_not_in_file(extra, survey.next_sample))
+        if not survey.scan.repairable and not more:
+            return _left_alone(path, survey)
+        layout = _check(survey, more)
+        with closing(Replacement(path, output)) as replacement:
+            saved = Rewritten(replacement.stream, survey)
+            saved.copy(RecoveryScan(stream, MessageValidator()).records())
+            if layout:
+                saved.add(more, filter(_plausible, events), layout)
+            ended = saved.finish(end, ended_at if ended_at < LAST_SAMPLE else 0)
+            if not HAS_LOCKS:
+                stream.close()
+            kept = replacement.put()
     return Recovered(
         path=replacement.final,
         original=kept,

@@ -9,11 +9,12 @@ import os
 import signal
 import sys
 import time
+from collections.abc import Sequence
 from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.device import Clock
+from hilctl.base.device import Clock, Device
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.segments import Segment
@@ -27,7 +28,7 @@ from hilctl.loop.plan import LoopPlan
 from hilctl.loop.safe_output import LoopOutcome, SafeGoal, describe, drive_to_safe
 from hilctl.loop.tuning import LinearBypass, Tuning
 from hilctl.machine.procfs import ProcessUsage
-from hilctl.machine.rt_setup import be_ordinary, prepare, refusals, require, step_facts
+from hilctl.machine.rt_setup import SetUpStep, be_ordinary, prepare, refusals, require, step_facts
 from hilctl.run.assemble import assemble, starting_output
 from hilctl.run.job import Job
 from hilctl.run.run_folder import GUARDIAN, keep_removed
@@ -147,29 +148,7 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
     steps = prepare(config.realtime)
     if config.realtime.require:
         require(steps)
-    known = device.info.details
-    page.publish(PageField.AWAITS_DEVICE, 1)
-    _await(PageField.HAS_DEVICE, page, host)
-    device.open(config.sample_rate_hz, config.block)
-    try:
-        output = starting_output(device, config.safe.at_start)
-        waveform_at = loop.begin_at(output)
-        page.put_float(PageField.OUTPUT_AT_START, output)
-        page.put(
-            PageField.REAL_TIME, int(any(s.name == "fifo" and s.outcome == "done" for s in steps))
-        )
-        page.put(PageField.WAVEFORM_AT, waveform_at)
-        details = device.info.details.items()
-        learned = {f"device.{key}": value for key, value in details if key not in known}
-        facts = step_facts(steps) | learned
-        page.write_text(PageSlot.SET_UP, json.dumps([facts, refusals(steps)]))
-        # After the text, which the phase announces.
-        page.publish(PageField.PHASE, Phase.READY)
-        _await(PageField.GO, page, host)
-        start_ns = page.get(PageField.START_NS)
-    except BaseException:
-        device.close()  # without a safe value: nothing has moved, and the output must not jump
-        raise
+    start_ns = _start(loop, loaded, page, host, steps)
     try:
         if not plan.waits:  # until it starts, arming and readings are no hang
             page.publish(PageField.PHASE, Phase.RUNNING)
@@ -179,18 +158,60 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
         # Before the device is closed, which may take its timeouts and is no hang.
         host.closing()
     except BaseException as error:
-        pending = bool(page.get(PageField.EXCHANGING)) and not device.info.simulated
-        goal = SafeGoal(job.safe_value, job.ramp_per_s, ring.last_command(), pending)
-        found = drive_to_safe(device, goal, on_write=page.note_safe_write)
-        if found.state != "confirmed":
-            # The cause first: an unreachable device is often its consequence.
-            cause = str(error) if isinstance(error, HilctlError) else f"the loop broke: {error!r}"
-            raise RunError(f"{cause}; {describe(found.state, found.error)}") from error
+        _make_safe(job, device, ring, error)
         raise
     finally:
         device.close()
         page.leave_lateness(loop.lateness)
     return outcome
+
+
+def _start(
+    loop: Loop,
+    loaded: LoadedExperiment,
+    page: SharedPage,
+    host: RingHost,
+    steps: Sequence[SetUpStep],
+) -> int:
+    """Open the device, report that the loop is ready, and return the time of the start signal.
+
+    An error closes the device without a safe value: nothing has moved, and the output must not
+    jump.
+    """
+    config, device = loaded.config, loaded.device
+    known = device.info.details
+    page.publish(PageField.AWAITS_DEVICE, 1)
+    _await(PageField.HAS_DEVICE, page, host)
+    device.open(config.sample_rate_hz, config.block)
+    try:
+        output = starting_output(device, config.safe.at_start)
+        waveform_at = loop.begin_at(output)
+        page.put_float(PageField.OUTPUT_AT_START, output)
+        fifo = any(each.name == "fifo" and each.outcome == "done" for each in steps)
+        page.put(PageField.REAL_TIME, int(fifo))
+        page.put(PageField.WAVEFORM_AT, waveform_at)
+        details = device.info.details.items()
+        learned = {f"device.{key}": value for key, value in details if key not in known}
+        facts = step_facts(steps) | learned
+        page.write_text(PageSlot.SET_UP, json.dumps([facts, refusals(steps)]))
+        # After the text, which the phase announces.
+        page.publish(PageField.PHASE, Phase.READY)
+        _await(PageField.GO, page, host)
+        return page.get(PageField.START_NS)
+    except BaseException:
+        device.close()
+        raise
+
+
+def _make_safe(job: Job, device: Device, ring: SampleRing, error: BaseException) -> None:
+    """Drive the output to its safe value after an error; raise RunError if it is not confirmed."""
+    pending = bool(ring.page.get(PageField.EXCHANGING)) and not device.info.simulated
+    goal = SafeGoal(job.safe_value, job.ramp_per_s, ring.last_command(), pending)
+    found = drive_to_safe(device, goal, on_write=ring.page.note_safe_write)
+    if found.state != "confirmed":
+        # The cause first: an unreachable device is often its consequence.
+        cause = str(error) if isinstance(error, HilctlError) else f"the loop broke: {error!r}"
+        raise RunError(f"{cause}; {describe(found.state, found.error)}") from error
 
 
 def _await(field: PageField, page: SharedPage, host: RingHost) -> None:

@@ -15,7 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from hilctl import __version__
-from hilctl.base.device import AuxChannel
+from hilctl.base.device import AuxChannel, DeviceInfo
 from hilctl.base.errors import RunError
 from hilctl.base.events import CHANGES, Event
 from hilctl.base.samples import COLUMNS, NO_WAVEFORM, Flag, Samples
@@ -59,24 +59,11 @@ def run_facts(
         LABELS_FACT: json.dumps(config.labels, ensure_ascii=False),
         OVERRIDES_FACT: json.dumps(loaded.document.assignments, ensure_ascii=False),
         "started": started,
-        "hilctl": __version__,
-        "python": sys.version.split()[0],
-        "numpy": np.__version__,
-        "numba": version("numba"),
-        "host": platform.node(),
-        "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
-        "device": info.name,
-        "device_description": info.description,
-        "simulated": str(info.simulated).lower(),
-        "buffered": str(info.buffered).lower(),
-        "fifo_depth": str(info.fifo_depth),
         "block": str(config.block),
-        "latency_blocks": str(info.latency_blocks),
         "waveform_samples": str(checked.forecast.samples),
         "compensator": getattr(loaded.model, "kind", "none"),
         "initial_state": checked.begun.begins,
         "initial_state_run_id": checked.begun.run_id,
-        HOLDS_FACT: json.dumps(list(info.holds)),
         "experiment_sha256": experiment_sha256(loaded),
         "model_sha256": sha256_of(model_yaml),
         "correction_sha256": sha256_of(correction_yaml),
@@ -86,14 +73,42 @@ def run_facts(
         "max_missed_share": repr(config.timing.max_missed_share),
         "units": json.dumps({"t_rel": "s"} | {each.name: each.unit for each in recorded}),
     }
-    if info.aux:
-        facts[AUX_FACT] = json.dumps([asdict(each) for each in info.aux], ensure_ascii=False)
     facts |= {
         f"waveform.{key}": str(value)
         for key, value in config.waveform
         if isinstance(value, str | int | float)
     }
-    facts |= machine_facts(config.realtime, Path(config.recording.folder))
+    return (
+        facts
+        | _software_facts()
+        | machine_facts(config.realtime, Path(config.recording.folder))
+        | _device_facts(info)
+    )
+
+
+def _software_facts() -> dict[str, str]:
+    return {
+        "hilctl": __version__,
+        "python": sys.version.split()[0],
+        "numpy": np.__version__,
+        "numba": version("numba"),
+        "host": platform.node(),
+        "kernel": f"{platform.system()} {platform.release()} {platform.machine()}",
+    }
+
+
+def _device_facts(info: DeviceInfo) -> dict[str, str]:
+    facts = {
+        "device": info.name,
+        "device_description": info.description,
+        "simulated": str(info.simulated).lower(),
+        "buffered": str(info.buffered).lower(),
+        "fifo_depth": str(info.fifo_depth),
+        "latency_blocks": str(info.latency_blocks),
+        HOLDS_FACT: json.dumps(list(info.holds)),
+    }
+    if info.aux:
+        facts[AUX_FACT] = json.dumps([asdict(each) for each in info.aux], ensure_ascii=False)
     facts |= {f"device.{key}": value for key, value in info.details.items()}
     return facts | {
         f"device.{name.removesuffix('.yaml')}_sha256": sha256_of(text)

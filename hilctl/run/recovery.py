@@ -21,6 +21,7 @@ from hilctl.run.run_folder import RunFolder, runs, taken_over
 from hilctl.run.shared.ring import SampleRing, safe_result_of
 from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, SharedPage
 
+_DIED = LoopOutcome("fault", "supervisor and loop died", 0, "unknown", 0)
 _RESULT_S = 1.0
 _POLL_S = 0.02
 
@@ -132,45 +133,47 @@ def _left_behind(
     run: RunFolder,
 ) -> tuple[LoopOutcome, list[BlockBatch], list[Event], dict[str, str]]:
     """Return the outcome, blocks and events that are only in memory, and metadata of the end."""
-    died = LoopOutcome("fault", "supervisor and loop died", 0, "unknown", 0)
     try:
         ring = SampleRing(run.ring)
     except (OSError, ValueError):
-        return (
-            died,
-            [],
-            [],
-            {
-                "code": died.code,
-                "reason": died.reason,
-                "output_safe": "false",
-                "output_state": died.output,
-            },
-        )
+        end = {
+            "code": _DIED.code,
+            "reason": _DIED.reason,
+            "output_safe": "false",
+            "output_state": _DIED.output,
+        }
+        return _DIED, [], [], end
+    page, batches = ring.page, _batches_in(ring)
+    outcome, events = _outcome_of(page), page.pop_events()
+    end = end_facts(outcome, page.lateness(), page.get(PageField.EVENTS_LOST))
+    return outcome, batches, events, end
+
+
+def _outcome_of(page: SharedPage) -> LoopOutcome:
+    """Return how the loop and, after it, the guardian ended."""
+    outcome = page.outcome() or _DIED
+    if page.observe(PageField.PHASE) == Phase.FAILED:
+        outcome = replace(_DIED, reason=page.read_text(PageSlot.ERROR))
+    if not page.ended_safely() and (result := page.safe_result()) is not None:
+        did = f"guardian: {describe(result.output, result.error)}"
+        outcome = replace(outcome, reason=f"{outcome.reason}; {did}", output=result.output)
+    return outcome
+
+
+def _batches_in(ring: SampleRing) -> list[BlockBatch]:
+    """Return the blocks of a ring, with the one that was under way when the loop died."""
     batches = []
     while True:
         while (batch := ring.pop()) is not None:
             batches.append(batch)
         if not ring.skip_damaged():
             break
-    page = ring.page
-    outcome = page.outcome() or died
-    if page.observe(PageField.PHASE) == Phase.FAILED:
-        outcome = replace(died, reason=page.read_text(PageSlot.ERROR))
-    if not page.ended_safely() and (result := page.safe_result()) is not None:
-        did = f"guardian: {describe(result.output, result.error)}"
-        outcome = replace(outcome, reason=f"{outcome.reason}; {did}", output=result.output)
-    if page.observe(PageField.PHASE) != Phase.ENDED:
+    if ring.page.observe(PageField.PHASE) != Phase.ENDED:
         last = batches[-1].heads[-1] if batches else None
         next_sample = 0 if last is None else int(last[BlockHeader.FIRST_SAMPLE]) + ring.block
         if (unanswered := ring.unanswered(next_sample)) is not None:
             batches.append(unanswered)
-    return (
-        outcome,
-        batches,
-        page.pop_events(),
-        end_facts(outcome, page.lateness(), page.get(PageField.EVENTS_LOST)),
-    )
+    return batches
 
 
 @contextmanager

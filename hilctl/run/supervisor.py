@@ -302,10 +302,7 @@ class Supervisor:
             _go(ring.page, start_ns)
             # From here on the processes of this run keep the output safe.
             relief.relieve()
-            if (trigger := config.trigger) is not None and trigger.start is not None:
-                name = self._checked.loaded.device.info.digital_input
-                awaited = name, trigger.start, trigger.timeout_s
-                _log.warning("waiting until %s is %s, at most %g s", *awaited)
+            self._announce_trigger()
             self._monitor(started, server)
             ring.page.put(PageField.RECORDED, int(not recorder.error))
             stops = self._stops
@@ -317,6 +314,13 @@ class Supervisor:
                 # For its guardian, the next command, or samples that are only in the ring.
                 folder.keep(recorded=not recorder.error)
             return self._result(outcome, started.broke, recorder, ring, folder, guarded=guarded)
+
+    def _announce_trigger(self) -> None:
+        trigger = self._config.trigger
+        if trigger is not None and trigger.start is not None:
+            name = self._checked.loaded.device.info.digital_input
+            awaited = name, trigger.start, trigger.timeout_s
+            _log.warning("waiting until %s is %s, at most %g s", *awaited)
 
     def _start(
         self,

@@ -25,11 +25,7 @@ import numpy as np
 
 from hilctl.base.types import F64, F64_2D
 from hilctl.kernels.jit import kernel
-from hilctl_drivers.simulated.actuator_base import (
-    Coil,
-    RodParameters,
-    Rods,
-)
+from hilctl_drivers.simulated.actuator_base import Coil, RodParameters, Rods
 from tests.rigs import ROD_LENGTH_M, ROD_RADIUS_M, VACUUM_PERMEABILITY
 
 _NEWTON_STEPS = 20
@@ -55,8 +51,7 @@ class DiffusionParameters(RodParameters):
 
     def rods(self, coil: Coil) -> Rods:
         """Return shells of pinned cells in a coil."""
-        bias = coil.bias_a_per_m
-        curve = saturation, knee = self.saturation_a_per_m, self.knee_a_per_m
+        bias, saturation, knee = coil.bias_a_per_m, self.saturation_a_per_m, self.knee_a_per_m
         strain_um = 1.5e6 * self.saturation_strain * ROD_LENGTH_M
         state = np.zeros((3, self.shells))
         pinned = np.zeros((self.cells, self.shells))
@@ -68,10 +63,17 @@ class DiffusionParameters(RodParameters):
             state[:] = [[bias], [saturation * share], [0.0]]
             return strain_um * share * share
 
-        cells, conductances, areas = self.cell_table(), self.conductances(coil.step_s), self.areas()
-        field = coil.factor_per_m, bias
         return Rods(
-            rest, _follow, state, pinned, cells, conductances, areas, field, curve, strain_um
+            rest,
+            _follow,
+            state,
+            pinned,
+            self.cell_table(),
+            self.conductances(coil.step_s),
+            self.areas(),
+            (coil.factor_per_m, bias),
+            (saturation, knee),
+            strain_um,
         )
 
     def varied(self, lag: float, pinning: float, strain: float) -> "DiffusionParameters":

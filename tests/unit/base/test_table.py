@@ -50,7 +50,7 @@ def test_column_that_nobody_named(tmp_path: Path) -> None:
     ([0, 1, 2, 1.5, 4], 0.5, "t.csv:4: samples must be evenly spaced in time: this one is -0.5 s"),
     ([0, 1, 2, 3, -9], 0.5, "t.csv:5: samples must be evenly spaced in time: this one is -12 s"),
     ([0, 1, 2.02, 3, 4], 0.01, "t.csv:3: samples must be evenly spaced in time: this one is 1.02"),
-    ([4, 3, 2, 1, 0], 0.5, "t.csv: time must rise from row to row, by -1 s as a rule here"),
+    ([4, 3, 2, 1, 0], 0.5, "t.csv: time must rise"),
     ([7], 0.5, "t.csv: holds one row of numbers"),
     ([*np.arange(50), *(50 + 1.2 * np.arange(50))], 0.5, "t.csv:"),
 ])  # fmt: skip
