@@ -77,27 +77,7 @@ def demo(
     before: Path | None = None
     for (which, _, settings), experiment in zip(_DEMO_RUNS, files, strict=True):
         over = [f"waveform.duration_s={_DEMO_S:g}", f"recording.folder={folder}", *settings]
-        with run_progress(quiet=as_json) as on_progress:
-            result = api.run(experiment, settings=over, on_progress=on_progress)
-        if result.stop_signal:
-            raise typer.Exit(128 + result.stop_signal)
-        page = result.path.with_suffix(".html")
-        report = api.report_page(result.path, page, before=before)
-        before = result.path
-        results[which] = {
-            "recording": str(result.path),
-            "page": str(page),
-            "code": result.code,
-            "peak_hysteresis_percent": report.peak_hysteresis_percent,
-            "deadline_misses": result.deadline_misses,
-        }
-        if not as_json:
-            percent = report.peak_hysteresis_percent
-            value = "no value" if percent is None else f"{percent:.2f} % peak hysteresis"
-            print(f"{which + ' the inverse':20} {value:28} {result.code}: {result.reason}")
-            if result.deadline_misses:
-                print(f"{'':20} {result.deadline_misses}")
-            print(f"{'':20} {page}")
+        before, results[which] = _demo_run(which, experiment, over, before, as_json=as_json)
     if as_json:
         print_json(results)
     else:
@@ -106,6 +86,31 @@ def demo(
         print(f"  hilctl run {own}\n  hilctl examples")
     if any(each["code"] == "fault" for each in results.values()):
         raise typer.Exit(3)
+
+
+def _demo_run(
+    which: str, experiment: Path, settings: list[str], before: Path | None, *, as_json: bool
+) -> tuple[Path, dict[str, Any]]:
+    """Run, report and print one of the two runs; return its recording and its facts."""
+    with run_progress(quiet=as_json) as on_progress:
+        result = api.run(experiment, settings=settings, on_progress=on_progress)
+    if result.stop_signal:
+        raise typer.Exit(128 + result.stop_signal)
+    page = result.path.with_suffix(".html")
+    percent = api.report_page(result.path, page, before=before).peak_hysteresis_percent
+    if not as_json:
+        value = "no value" if percent is None else f"{percent:.2f} % peak hysteresis"
+        print(f"{which + ' the inverse':20} {value:28} {result.code}: {result.reason}")
+        if result.deadline_misses:
+            print(f"{'':20} {result.deadline_misses}")
+        print(f"{'':20} {page}")
+    return result.path, {
+        "recording": str(result.path),
+        "page": str(page),
+        "code": result.code,
+        "peak_hysteresis_percent": percent,
+        "deadline_misses": result.deadline_misses,
+    }
 
 
 def init(
