@@ -85,11 +85,14 @@ def experiment(
 
 def job(folder: RunFolder, checked: CheckedExperiment) -> Job:
     """Return what the supervisor hands to the loop process, without a heartbeat timeout."""
-    return Job.of(checked, folder, supervisor=os.getppid(), silence_s=1e9)
+    return Job.of(
+        checked, folder, locks=[], take_over=False, supervisor=os.getppid(), silence_s=1e9
+    )
 
 
 def start(page: SharedPage) -> None:
-    """Give the start signal once all is compiled, as the supervisor does."""
+    """Give the device and, once all is compiled, the start signal, as the supervisor does."""
+    page.put(PageField.HAS_DEVICE, 1)
     while page.get(PageField.PHASE) != Phase.READY:
         time.sleep(0.01)
     page.put(PageField.START_NS, time.monotonic_ns() + 50_000_000)
