@@ -10,7 +10,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator
 from contextlib import contextmanager
-from dataclasses import asdict, dataclass, field
+from dataclasses import asdict, dataclass, field, fields
 from pathlib import Path
 from typing import ClassVar
 
@@ -21,6 +21,7 @@ from hilctl.base.errors import DeviceError
 from hilctl.base.samples import BlockBatch, BlockHeader
 from hilctl.loop.block import Block
 from hilctl.loop.interlocks import AuxLimit, InterlockContext, Interlocks, InterlockSettings
+from hilctl.loop.plan import AxisPlan, LoopPlan
 from hilctl.run.run_folder import DeviceLocks
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
@@ -199,7 +200,7 @@ class FakeFifoDevice:
 
 
 class FakeHost:
-    """A host that stores all blocks of the loop, and requests a stop or a tuning.
+    """A host of one axis, and its lane: it stores all blocks, and requests a stop or a tuning.
 
     Args:
         clock: The clock.
@@ -214,6 +215,7 @@ class FakeHost:
         self, clock, block=1, state_size=1, *, full=range(0), stop=lambda: "", tunings=None
     ):
         self.clock, self._shape = clock, (block, state_size)
+        self.lanes = [self]
         self.full, self.stop, self.tunings = full, stop, tunings or {}
         self.heads, self.columns, self.flags, self.states = [], [], [], []
         self.events, self.heartbeats, self.safe_writes = [], [], []
@@ -258,6 +260,13 @@ class FakeHost:
 
     def column(self, row):
         return np.concatenate([columns[row] for columns in self.columns])
+
+
+def loop_plan(**options):
+    """Return a plan of one axis, from the fields of both parts of a plan."""
+    names = {each.name for each in fields(AxisPlan)}
+    axis = AxisPlan(**{name: options.pop(name) for name in names & options.keys()})
+    return LoopPlan(axes=(axis,), **options)
 
 
 def made_block(block=1, state_size=1, fill=np.nan, aux=0):

@@ -1,5 +1,6 @@
 """The plan of a run, and the host that a loop runs in."""
 
+from collections.abc import Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -19,13 +20,33 @@ from hilctl.loop.tuning import Tuning
 
 
 @dataclass(frozen=True, slots=True)
-class LoopPlan:
-    """The plan of a run.
+class AxisPlan:
+    """The plan of one axis.
 
     Attributes:
         reference: float64[n], in the waveform's unit.
         input_um: float64[n], the compensator's input: the reference shifted by its preview, with
             corrections; the reference itself without a compensator.
+        name: Name of the axis in events; empty if it is the only one.
+    """
+
+    reference: F64
+    input_um: F64
+    compensator: Compensator
+    limits: CommandLimits
+    interlocks: InterlockContext
+    interlock_settings: InterlockSettings = field(default_factory=InterlockSettings)
+    feedback: Controller | None = None
+    adaptation: Adaptation | None = None
+    conditioning: Conditioning | None = None
+    name: str = ""
+
+
+@dataclass(frozen=True, slots=True)
+class LoopPlan:
+    """The plan of a run: what all axes have in common, and that of each axis.
+
+    Attributes:
         block: Samples per exchange.
         latency_blocks: Exchanges from a block's commands to its displacements.
         late_policy: Policy for late ticks in waveform and safe ramp. If the host paces the device,
@@ -33,20 +54,12 @@ class LoopPlan:
         keep_all: Whether a block that is dropped because the ring is full ends the run.
     """
 
-    reference: F64
-    input_um: F64
+    axes: tuple[AxisPlan, ...]
     block: int
     latency_blocks: int
     sample_rate_hz: float
-    compensator: Compensator
-    limits: CommandLimits
-    interlocks: InterlockContext
-    interlock_settings: InterlockSettings = field(default_factory=InterlockSettings)
     late_policy: LatePolicy = "skip"
     late_rules: LateRules = field(default_factory=LateRules)
-    feedback: Controller | None = None
-    adaptation: Adaptation | None = None
-    conditioning: Conditioning | None = None
     triggers: Triggers | None = None
     keep_all: bool = True
 
@@ -63,16 +76,11 @@ class LoopPlan:
     @property
     def samples(self) -> int:
         """Samples of the waveform."""
-        return self.reference.size
+        return self.axes[0].reference.size
 
 
-class Host(Protocol):
-    """Clock, slots of blocks, and supervision; no call except the clock's sleep may block."""
-
-    @property
-    def clock(self) -> Clock:
-        """The clock."""
-        ...
+class Lane(Protocol):
+    """Where the blocks and events of one axis come from and go to."""
 
     def claim(self, *, due: bool = True) -> Block:
         """Return the next block; a spare slot if it is not due, or if the ring is full.
@@ -87,6 +95,28 @@ class Host(Protocol):
 
     def answered(self, block: Block) -> bool:
         """Pass a block on to be recorded; return False if it was in a spare slot."""
+        ...
+
+    def writing_safe(self, value: float) -> None:
+        """Note a write of the safe ramp, so that another process can continue it."""
+        ...
+
+    def record_event(self, event: Event) -> None:
+        """Record an event."""
+        ...
+
+
+class Host(Protocol):
+    """Clock, lanes, and supervision; no call except the clock's sleep may block."""
+
+    @property
+    def clock(self) -> Clock:
+        """The clock."""
+        ...
+
+    @property
+    def lanes(self) -> Sequence[Lane]:
+        """The lanes, in the order of the plan's axes."""
         ...
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
@@ -104,14 +134,6 @@ class Host(Protocol):
         """Note that the loop has ended; closing the device may take its timeouts."""
         ...
 
-    def writing_safe(self, value: float) -> None:
-        """Note a write of the safe ramp, so that another process can continue it."""
-        ...
-
     def tuning(self) -> Tuning | None:
         """Return a requested change that begins now, each one once."""
-        ...
-
-    def record_event(self, event: Event) -> None:
-        """Record an event."""
         ...

@@ -6,7 +6,8 @@ writes (:meth:`hilctl.base.device.Device.make_safe`) and never retries.
 
 import errno
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
+from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
 from typing import Literal, TypeAlias, cast
 
@@ -214,6 +215,43 @@ def drive_to_safe(
         if output.final or output.state == "set" or clock() >= give_up_s:
             return output
         sleep(output.pause_s)
+
+
+_WORST: tuple[OutputState, ...] = ("unknown", "sent", "set", "confirmed")
+
+
+def joint_state(outputs: Sequence[SafeOutput], names: Sequence[str]) -> tuple[OutputState, str]:
+    """Return the worst state of several outputs, and why those in it are not confirmed."""
+    state = min((each.state for each in outputs), key=_WORST.index)
+    whys = [
+        f"{name}: {each.error}" if name and each.error else each.error
+        for each, name in zip(outputs, names, strict=True)
+        if each.state == state
+    ]
+    return state, "; ".join(filter(None, whys))
+
+
+def drive_all_to_safe(
+    devices: Sequence[Device],
+    goals: Sequence[SafeGoal],
+    clock: Callable[[], float],
+    sleep: Callable[[float], None],
+    on_writes: Sequence[Callable[[float], None]],
+) -> list[SafeOutput]:
+    """Drive each device to its safe value; none waits for the timeouts of another one.
+
+    See :func:`drive_to_safe` for the arguments, of which the sequences have one per device.
+    """
+    outputs = list(zip(devices, goals, on_writes, strict=True))
+    if len(outputs) == 1:
+        device, goal, on_write = outputs[0]
+        return [drive_to_safe(device, goal, clock, sleep, on_write)]
+    with ThreadPoolExecutor(len(outputs)) as threads:
+        started = [
+            threads.submit(drive_to_safe, device, goal, clock, sleep, on_write)
+            for device, goal, on_write in outputs
+        ]
+        return [each.result() for each in started]
 
 
 def _is_local(error: BaseException | None) -> bool:

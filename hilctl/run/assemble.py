@@ -16,7 +16,7 @@ from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.lead_in import Conditioning
 from hilctl.loop.pacer import LatePolicy, LateRules
-from hilctl.loop.plan import LoopPlan
+from hilctl.loop.plan import AxisPlan, LoopPlan
 
 _ALWAYS_LATE_S = 2.0
 _MISSED_WINDOW_S = 10.0
@@ -71,21 +71,24 @@ def assemble(
     compensator.warm_up()
     if state is not None:
         compensator.restore(state)
-    return LoopPlan(
+    axis = AxisPlan(
         reference=reference,
         input_um=input_um,
-        block=config.block,
-        latency_blocks=info.latency_blocks,
-        sample_rate_hz=rate_hz,
         compensator=compensator,
         limits=config.command_limits(),
         interlocks=replace(interlock_context(config, info), heat_a2=heat_a2),
         interlock_settings=config.interlocks,
-        late_policy=_late_policy(info) if paced else "catch_up",
-        late_rules=_late_rules(config, reference.size) if paced else LateRules(),
         feedback=make_feedback(config, compensator, info.latency_blocks),
         adaptation=make_adaptation(config, operator, compensator),
         conditioning=conditioning,
+    )
+    return LoopPlan(
+        axes=(axis,),
+        block=config.block,
+        latency_blocks=info.latency_blocks,
+        sample_rate_hz=rate_hz,
+        late_policy=_late_policy(info) if paced else "catch_up",
+        late_rules=_late_rules(config, reference.size) if paced else LateRules(),
         triggers=None if config.trigger is None else config.trigger.of(segments),
         keep_all=config.recording.on_failure == "stop",
     )

@@ -45,17 +45,29 @@ _SILENCE_S = 1.0
 _POLL_S = 0.01
 
 
-class RingHost:
-    """See :class:`hilctl.loop.plan.Host`."""
+class RingLane:
+    """The ring of one axis; see :class:`hilctl.loop.plan.Lane`."""
 
-    def __init__(self, ring: SampleRing, clock: Clock, supervisor: int, silence_s: float) -> None:
+    def __init__(self, ring: SampleRing) -> None:
         ring.prepare_blocks()
-        self.clock = clock
         self.claim, self.sending, self.answered = ring.claim, ring.sending, ring.answered
         self.record_event = ring.page.push_event
         self.writing_safe = ring.page.note_safe_write
-        self._page = ring.page
-        self._numbers = ring.page.numbers
+
+
+class RingHost:
+    """A host with a ring per axis; the page of the first one is that of the run.
+
+    See :class:`hilctl.loop.plan.Host`.
+    """
+
+    def __init__(
+        self, rings: Sequence[SampleRing], clock: Clock, supervisor: int, silence_s: float
+    ) -> None:
+        self.clock = clock
+        self.lanes = [RingLane(each) for each in rings]
+        self._page = rings[0].page
+        self._numbers = self._page.numbers
         self._supervisor = supervisor
         self._silence_ns = silence_s * 1e9
         self._silent = (
@@ -140,9 +152,9 @@ def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
     """Run a job, from set-up to the closed device; an error leaves a moved output safe."""
     loaded = loaded_of(job)
     config, device, page = loaded.config, loaded.device, ring.page
-    host = RingHost(ring, SystemClock(), job.supervisor, job.silence_s)
+    host = RingHost([ring], SystemClock(), job.supervisor, job.silence_s)
     plan = plan_of(job, loaded)
-    loop = Loop(plan, device, host)
+    loop = Loop(plan, [device], host)
     # After the warm-up, so that all its memory is locked; before the device is opened, so that a
     # refusal moves nothing.
     steps = prepare(config.realtime)
@@ -185,7 +197,7 @@ def _start(
     device.open(config.sample_rate_hz, config.block)
     try:
         output = starting_output(device, config.safe.at_start)
-        waveform_at = loop.begin_at(output)
+        waveform_at = loop.begin_at([output])
         page.put_float(PageField.OUTPUT_AT_START, output)
         fifo = any(each.name == "fifo" and each.outcome == "done" for each in steps)
         page.put(PageField.REAL_TIME, int(fifo))

@@ -4,8 +4,9 @@ Check, loop, compensator, limiter, interlocks and recorder are those of a paced 
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +20,7 @@ from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.block import Block
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness
-from hilctl.loop.plan import LoopPlan
+from hilctl.loop.plan import AxisPlan, LoopPlan
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.loop.tuning import Tuning
 from hilctl.run.assemble import assemble, starting_output
@@ -45,51 +46,44 @@ class VirtualClock:
         self._now_ns = max(self._now_ns, deadline_ns)
 
 
-class OfflineHost:
-    """A host that collects blocks in this process; a batch is valid until ``on_batch`` returns."""
+class OfflineLane:
+    """Blocks of one axis, collected in this process.
+
+    A batch is valid until ``on_batch`` returns. See :class:`hilctl.loop.plan.Lane`.
+    """
 
     def __init__(
         self,
         plan: LoopPlan,
-        *,
+        axis: AxisPlan,
         on_batch: Callable[[BlockBatch], None],
-        on_event: Callable[[Event], None] = lambda event: None,
-        stop: Callable[[], str] = lambda: "",
+        on_event: Callable[[Event], None],
     ) -> None:
-        self.clock: Clock = VirtualClock()
         # No slot is reused before its batch was passed on.
         slots = _BLOCKS_A_BATCH + 2 * (plan.latency_blocks + 1)
-        state_size, aux = plan.compensator.state_size + 1, len(plan.interlocks.aux)
+        state_size, aux = axis.compensator.state_size + 1, len(axis.interlocks.aux)
         self._room = BlockBatch.empty(slots, plan.block, state_size, aux)
         heads = [head.data.cast("B").cast("q") for head in self._room.heads]
         self._blocks = [Block(head, self._room, slot) for slot, head in enumerate(heads)]
-        self._claimed = self._first = self._answered = 0
-        self._exchanging, self._seen = False, -1
-        self._on_batch, self._on_event, self._stop = on_batch, on_event, stop
+        self.claimed = self._first = self._answered = 0
+        self.exchanging = False
+        self._on_batch, self._on_event = on_batch, on_event
 
     def claim(self, *, due: bool = True) -> Block:
         """Return the next block."""
-        block = self._blocks[self._claimed % len(self._blocks)]
-        block.number, block.due = self._claimed if due else -1, due
-        self._claimed += 1
-        self._exchanging = False
+        block = self._blocks[self.claimed % len(self._blocks)]
+        block.number, block.due = self.claimed if due else -1, due
+        self.claimed += 1
+        self.exchanging = False
         return block
 
     def sending(self, block: Block) -> None:
         """Note that an exchange begins."""
-        self._exchanging = True
-
-    def check_exchange(self) -> None:
-        """Raise TimeoutError if the same exchange was active at the last call."""
-        if self._exchanging and self._seen == self._claimed:
-            # Time passes for the attempts to set the safe value, too.
-            self.clock.sleep_until_ns(self.clock.now_ns() + round(PATIENCE_S * 1e9))
-            raise TimeoutError(f"it has not returned within {PATIENCE_S:g} s")
-        self._seen = self._claimed
+        self.exchanging = True
 
     def answered(self, block: Block) -> bool:
         """Collect a block."""
-        self._exchanging = False
+        self.exchanging = False
         self._answered = block.number + 1
         if self._answered - self._first == _BLOCKS_A_BATCH:
             self.flush()
@@ -105,6 +99,47 @@ class OfflineHost:
             self._room.clear_answers(taken)
             self._first = self._answered
 
+    def writing_safe(self, value: float) -> None:
+        """Do nothing: no other process continues the ramp."""
+
+    def record_event(self, event: Event) -> None:
+        """Pass an event on, after the blocks before it."""
+        self.flush()
+        self._on_event(event)
+
+
+class OfflineHost:
+    """A host without real time; the functions ``on_batch`` and ``on_event`` are one per axis."""
+
+    def __init__(
+        self,
+        plan: LoopPlan,
+        *,
+        on_batch: Sequence[Callable[[BlockBatch], None]],
+        on_event: Sequence[Callable[[Event], None]],
+        stop: Callable[[], str] = lambda: "",
+    ) -> None:
+        self.clock: Clock = VirtualClock()
+        self.lanes = [
+            OfflineLane(plan, *each) for each in zip(plan.axes, on_batch, on_event, strict=True)
+        ]
+        self._seen = -1
+        self._stop = stop
+
+    def check_exchange(self) -> None:
+        """Raise TimeoutError if the same exchange was active at the last call."""
+        claimed = self.lanes[0].claimed
+        if self._seen == claimed and any(each.exchanging for each in self.lanes):
+            # Time passes for the attempts to set the safe value, too.
+            self.clock.sleep_until_ns(self.clock.now_ns() + round(PATIENCE_S * 1e9))
+            raise TimeoutError(f"it has not returned within {PATIENCE_S:g} s")
+        self._seen = claimed
+
+    def flush(self) -> None:
+        """Pass the collected blocks of all axes on."""
+        for lane in self.lanes:
+            lane.flush()
+
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
         """Return the reason to stop, or an empty text."""
         return self._stop()
@@ -118,14 +153,6 @@ class OfflineHost:
     def tuning(self) -> Tuning | None:
         """Return None: no change is requested."""
         return None
-
-    def writing_safe(self, value: float) -> None:
-        """Do nothing: no other process continues the ramp."""
-
-    def record_event(self, event: Event) -> None:
-        """Pass an event on, after the blocks before it."""
-        self.flush()
-        self._on_event(event)
 
 
 def run_unpaced(checked: CheckedExperiment, output: Path, *, overwrite: bool = False) -> RunResult:
@@ -176,60 +203,86 @@ def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, L
         if recorder.next_sample % flush_samples < batch.flags.size:
             recorder.flush()
 
-    host = OfflineHost(plan, on_batch=written, on_event=recorder.event, stop=refused)
+    host = OfflineHost(plan, on_batch=[written], on_event=[recorder.event], stop=refused)
+    devices = [loaded.device]
     try:
-        loop, waveform_at = _opened(plan, loaded.device, host, loaded.config.safe.at_start)
+        loop, waveform_at = _opened(plan, devices, host, [loaded.config.safe.at_start])
         recorder.begin(time.time_ns(), {"paced": "false"}, waveform_at)
     except HilctlError:
-        _closed(loaded.device)
+        _closed(devices)
         recorder.discard()
         raise
-    return _drive(loop, loaded.device, host)
+    return _drive(loop, devices, host)
 
 
-def run_in_memory(plan: LoopPlan, device: Device) -> tuple[LoopOutcome, Samples]:
-    """Run a plan on a simulated device; return the outcome and the samples from the waveform on."""
-    parts: list[Samples] = []
-    host = OfflineHost(plan, on_batch=lambda batch: parts.append(batch.samples(slice(None))))
-    loop, waveform_at = _opened(plan, device, host, None)
-    outcome, _ = _drive(loop, device, host)
+def run_in_memory(plan: LoopPlan, devices: Sequence[Device]) -> tuple[LoopOutcome, list[Samples]]:
+    """Run a plan on simulated devices.
+
+    Return the outcome, and the samples of each axis from the waveform on.
+    """
+    lanes: list[list[Samples]] = [[] for _ in devices]
+
+    def collect(batch: BlockBatch, parts: list[Samples]) -> None:
+        parts.append(batch.samples(slice(None)))
+
+    host = OfflineHost(
+        plan,
+        on_batch=[partial(collect, parts=each) for each in lanes],
+        on_event=[lambda event: None for _ in lanes],
+    )
+    loop, waveform_at = _opened(plan, devices, host, [None] * len(devices))
+    outcome, _ = _drive(loop, devices, host)
+    return outcome, [_joined(parts, waveform_at) for parts in lanes]
+
+
+def _joined(parts: list[Samples], waveform_at: int) -> Samples:
     values = np.concatenate([[*part.columns().values()] for part in parts], axis=1)
     index = np.concatenate([part.index for part in parts])
     samples = Samples.of(index, values, np.concatenate([part.flags for part in parts]))
-    return outcome, samples.rows(index >= waveform_at)
+    return samples.rows(index >= waveform_at)
 
 
 def _opened(
-    plan: LoopPlan, device: Device, host: OfflineHost, at_start: float | None
+    plan: LoopPlan,
+    devices: Sequence[Device],
+    host: OfflineHost,
+    at_start: Sequence[float | None],
 ) -> tuple[Loop, int]:
-    """Open the device; return the loop, and the number of samples before the waveform."""
-    loop = Loop(plan, device, host)
-    with time_limit():
-        device.open(plan.sample_rate_hz, plan.block)
-        try:
-            return loop, loop.begin_at(starting_output(device, at_start))
-        except HilctlError:
-            _closed(device)
-            raise
+    """Open the devices; return the loop, and the number of samples before the waveform."""
+    loop = Loop(plan, devices, host)
+    opened: list[Device] = []
+    try:
+        with time_limit():
+            for device in devices:
+                device.open(plan.sample_rate_hz, plan.block)
+                opened.append(device)
+            return loop, loop.begin_at([*map(starting_output, devices, at_start)])
+    except HilctlError:
+        _closed(opened)
+        raise
 
 
-def _drive(loop: Loop, device: Device, host: OfflineHost) -> tuple[LoopOutcome, Lateness]:
+def _drive(
+    loop: Loop, devices: Sequence[Device], host: OfflineHost
+) -> tuple[LoopOutcome, Lateness]:
     try:
         with alarm(host.check_exchange, PATIENCE_S):
             outcome = loop.run(0)
     finally:
-        failed = _closed(device)
+        failed = _closed(devices)
         host.flush()
     if failed:
         outcome = replace(outcome, code="fault", reason=f"{outcome.reason}; then {failed}")
     return outcome, loop.lateness
 
 
-def _closed(device: Device) -> str:
-    """Close a device; return why that failed, or an empty text."""
-    try:
-        with time_limit():
-            device.close()
-    except DeviceError as error:
-        return str(error)
-    return ""
+def _closed(devices: Sequence[Device]) -> str:
+    """Close devices; return why that failed, or an empty text."""
+    failed = []
+    for device in devices:
+        try:
+            with time_limit():
+                device.close()
+        except DeviceError as error:
+            failed.append(str(error))
+    return "; ".join(failed)

@@ -18,11 +18,10 @@ from hilctl.loop.compensator import Compensator
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
-from hilctl.loop.plan import LoopPlan
 from hilctl.loop.triggers import Triggers
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import load_profile
-from tests.fakes import FakeClock, FakeHost, emulated, logged
+from tests.fakes import FakeClock, FakeHost, emulated, logged, loop_plan
 
 DCON = (Path(__file__).parents[1] / "data" / "dcon_module.yaml").read_text()
 DIGITAL = """
@@ -60,7 +59,7 @@ class Bench:
         rate_hz = rate_hz or min(100.0, device.info.max_rate_hz)
         device.open(rate_hz, 1)
         values = 0.5 * np.sin(np.arange(samples))
-        plan = LoopPlan(
+        plan = loop_plan(
             reference=values,
             input_um=values,
             block=1,
@@ -72,8 +71,8 @@ class Bench:
             triggers=Triggers(**{"marks": np.empty(0, np.int64), **triggers}),
         )
         self.host = FakeHost(self.clock)
-        loop = Loop(plan, device, self.host)
-        loop.begin_at(0.0)
+        loop = Loop(plan, [device], self.host)
+        loop.begin_at([0.0])
         self.opened = len(self.events)
         try:
             return loop.run(self.clock.now)

@@ -14,9 +14,8 @@ from hilctl.loop.compensator import Compensator
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
-from hilctl.loop.plan import LoopPlan
 from hilctl.models.plays import PpiModel
-from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, made_block
+from tests.fakes import FakeClock, FakeFifoDevice, FakeHost, loop_plan, made_block
 
 RATE_HZ, SLEW_PER_S = 1000.0, 400.0
 LIMITS = CommandLimits(-4.0, 4.0, SLEW_PER_S, 0.0, 100.0)
@@ -91,7 +90,7 @@ def test_any_broken_rig(how, at, size, bounds, way):
     compensator = Compensator(MODEL, RATE_HZ)
     device = Broken(latency, how, at, size)
     host = FakeHost(FakeClock(), block, compensator.state_size + 1)
-    plan = LoopPlan(
+    plan = loop_plan(
         reference=REFERENCE,
         input_um=REFERENCE,
         block=block,
@@ -102,8 +101,8 @@ def test_any_broken_rig(how, at, size, bounds, way):
         interlocks=InterlockContext(stroke_um=(-1e3, 1e3)),
         adaptation=adaptation,
     )
-    loop = Loop(plan, device, host)
-    loop.begin_at(0.0)
+    loop = Loop(plan, [device], host)
+    loop.begin_at([0.0])
     assert loop.run(0).code == "completed"
     assert within(adaptation, operator)
     commands = np.array([0.0, *device.commands])

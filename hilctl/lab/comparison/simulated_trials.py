@@ -117,8 +117,9 @@ class TrialDevice:
         loaded = replace(self._loaded, model=model)
         begun = begin(model, reference.sample_rate_hz, reference.values)
         values = (reference.values, begun.input_um[:], begun.state)
-        plan = replace(
-            assemble(loaded, *values, paced=False),
+        plan = assemble(loaded, *values, paced=False)
+        axis = replace(
+            plan.axes[0],
             # Evaluate inaccurate models, too, instead of stopping them.
             interlocks=InterlockContext(
                 stroke_um=(-math.inf, math.inf),
@@ -127,7 +128,7 @@ class TrialDevice:
             interlock_settings=InterlockSettings(),
             feedback=None,
         )
-        outcome, samples = run_in_memory(plan, loaded.device)
+        outcome, [samples] = run_in_memory(replace(plan, axes=(axis,)), [loaded.device])
         if outcome.code == "fault":
             raise DeviceError(outcome.reason)
         return _judged(reference, samples.displacement_um, samples.flags)

@@ -14,10 +14,9 @@ from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import LateRules
-from hilctl.loop.plan import LoopPlan
 from hilctl.loop.tuning import LinearBypass, Tuning
 from hilctl.models.model_file import load_model
-from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost, FakeInfo
+from tests.fakes import FakeClock, FakeDevice, FakeFifoDevice, FakeHost, FakeInfo, loop_plan
 from tests.published import terfenol_rdpi
 
 RATE_HZ = 1000.0
@@ -36,7 +35,7 @@ class Rig:
             clock or FakeClock(), block, compensator.state_size + 1, **host_options
         )
         late = {"late_after_ns": 0.5e9 * block / RATE_HZ, "max_late_ns": 1e9}
-        plan = LoopPlan(
+        plan = loop_plan(
             reference=reference,
             input_um=options.get("input_um", reference),
             block=block,
@@ -52,10 +51,10 @@ class Rig:
             conditioning=options.get("conditioning"),
             keep_all=options.get("keep_all", False),
         )
-        self.loop = Loop(plan, self.device, self.host)
+        self.loop = Loop(plan, [self.device], self.host)
 
     def run(self):
-        self.waveform_at = self.loop.begin_at(self.device.output())
+        self.waveform_at = self.loop.begin_at([self.device.output()])
         return self.loop.run(1_000_000)
 
     @property
@@ -264,7 +263,7 @@ def test_the_watchdog_is_armed_just_before_the_first_exchange(takes_ns):
     clock = FakeClock()
     rig = Rig(sine(), device=WatchedDevice(clock=clock, takes_ns=takes_ns), clock=clock)
     start_ns = 50_000_000
-    rig.loop.begin_at(0.0)
+    rig.loop.begin_at([0.0])
     outcome = rig.loop.run(start_ns)
     assert (outcome.code, rig.loop.lateness.late_ticks) == ("completed", 0)
     assert rig.device.armed_ns == [start_ns - 5_000_000]

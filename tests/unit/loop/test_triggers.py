@@ -13,9 +13,8 @@ from hilctl.loop.compensator import Compensator
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
-from hilctl.loop.plan import LoopPlan
 from hilctl.loop.triggers import Triggers, marks_of
-from tests.fakes import FakeClock, FakeDevice, FakeHost
+from tests.fakes import FakeClock, FakeDevice, FakeHost, loop_plan
 
 MS = 1_000_000
 START_NS = 5 * MS
@@ -73,7 +72,7 @@ class Rig:
         self.host = FakeHost(clock or FakeClock(), stop=stop)
         values = np.linspace(0.0, 1.0, samples)
         triggers = {"marks": np.empty(0, np.int64), **triggers}
-        plan = LoopPlan(
+        plan = loop_plan(
             reference=values,
             input_um=values,
             block=1,
@@ -84,10 +83,10 @@ class Rig:
             interlocks=InterlockContext(stroke_um=(-60.0, 60.0)),
             triggers=Triggers(**triggers),
         )
-        self.loop = Loop(plan, self.device, self.host)
+        self.loop = Loop(plan, [self.device], self.host)
 
     def run(self):
-        self.loop.begin_at(self.device.output())
+        self.loop.begin_at([self.device.output()])
         return self.loop.run(START_NS)
 
     @property
@@ -114,7 +113,7 @@ def test_a_pulse_of_one_sample_at_each_mark():
 
 def test_marks_follow_the_initial_ramp():
     rig = Rig(marks=np.array([0]), device=DigitalDouble(output_at_open=1.0))
-    ramp = rig.loop.begin_at(1.0)
+    ramp = rig.loop.begin_at([1.0])
     rig.loop.run(START_NS)
     assert ramp > 1
     assert rig.flagged == [ramp]

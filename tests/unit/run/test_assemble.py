@@ -61,11 +61,11 @@ def test_a_run_without_a_pace_misses_nothing():
 
 def test_the_compensator_starts_from_the_memory_that_was_given():
     loaded = loaded_of(name="terfenol_sine_6a.yaml")
-    rest = planned(loaded).compensator
+    rest = planned(loaded).axes[0].compensator
     state = rest.state()
     state[0] += 0.25
-    np.testing.assert_array_equal(planned(loaded, state).compensator.state(), state)
-    np.testing.assert_array_equal(planned(loaded).compensator.state(), rest.state())
+    np.testing.assert_array_equal(planned(loaded, state).axes[0].compensator.state(), state)
+    np.testing.assert_array_equal(planned(loaded).axes[0].compensator.state(), rest.state())
 
 
 INFO = DeviceInfo("rig", "a rig", "A", -10.0, 10.0, -75.0, 75.0, 1e3)

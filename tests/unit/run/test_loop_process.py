@@ -21,7 +21,6 @@ from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness, LateRules
-from hilctl.loop.plan import LoopPlan
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.loop.tuning import LinearBypass, Tuning
 from hilctl.machine.procfs import ProcessUsage
@@ -35,7 +34,7 @@ from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, Stop
 from hilctl.run.start import checked_experiment
 from tests.commands import ended
-from tests.fakes import FakeClock, FakeDevice
+from tests.fakes import FakeClock, FakeDevice, loop_plan
 from tests.published import terfenol_rdpi
 
 EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
@@ -348,7 +347,7 @@ def host(ring, clock, monkeypatch):
     """A host whose supervisor is process 77 and shows life at once."""
     monkeypatch.setattr("os.getppid", lambda: 77)
     ring.page.put(PageField.SUPERVISOR_HEARTBEAT_NS, clock.now)
-    return RingHost(ring, clock, 77, SILENCE_S)
+    return RingHost([ring], clock, 77, SILENCE_S)
 
 
 def test_each_reason_to_end_is_said(host, ring, clock, monkeypatch):
@@ -404,7 +403,7 @@ def test_closing_is_shown_before_the_device_takes_its_time(host, ring, clock):
 
 def test_a_supervisor_may_be_silent_for_ever(ring, clock, monkeypatch):
     monkeypatch.setattr("os.getppid", lambda: 77)
-    assert RingHost(ring, clock, 77, math.inf).heartbeat(0, 0) == ""
+    assert RingHost([ring], clock, 77, math.inf).heartbeat(0, 0) == ""
 
 
 class AskingDevice(FakeDevice):
@@ -430,7 +429,7 @@ class Rig:
         compensator = Compensator(terfenol_rdpi(), 1000.0)
         compensator.warm_up()
         reference = 14.0 * np.sin(2 * np.pi * 25.0 * np.arange(self.SAMPLES) / 1000.0)
-        plan = LoopPlan(
+        plan = loop_plan(
             reference=reference,
             input_um=reference,
             block=block,
@@ -444,10 +443,10 @@ class Rig:
         size = compensator.state_size + 1
         self.ring = SampleRing.create(folder, slots=self.SLOTS, block=block, state_size=size)
         self.ring.page.put(PageField.SUPERVISOR_HEARTBEAT_NS, 1)
-        self.host = RingHost(self.ring, FakeClock(stall_ns=stalls or {}), os.getppid(), 5.0)
-        self.batches, self.answered = [], self.host.answered
-        self.host.answered = self.take
-        self.loop = Loop(plan, AskingDevice(at, act), self.host)
+        self.host = RingHost([self.ring], FakeClock(stall_ns=stalls or {}), os.getppid(), 5.0)
+        lane = self.host.lanes[0]
+        self.batches, self.answered, lane.answered = [], lane.answered, self.take
+        self.loop = Loop(plan, [AskingDevice(at, act)], self.host)
 
     def take(self, block):
         """Record each block as it comes, and give its slot back."""
@@ -457,7 +456,7 @@ class Rig:
         return done
 
     def run(self):
-        self.loop.begin_at(0.0)
+        self.loop.begin_at([0.0])
         return self.loop.run(1_000_000)
 
     def flags(self, number):

@@ -22,7 +22,7 @@ from hilctl.recording.reader import read
 from hilctl.recording.writer import PendingFile
 from hilctl.run.assemble import assemble
 from hilctl.run.start import checked_experiment
-from hilctl.run.unpaced import OfflineHost, VirtualClock, run_in_memory, run_unpaced
+from hilctl.run.unpaced import OfflineLane, VirtualClock, run_in_memory, run_unpaced
 from tests.fakes import FailingFile
 
 UNCOMPENSATED = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a_uncompensated.yaml"
@@ -30,11 +30,9 @@ SHORT = ["waveform.duration_s=0.25", "waveform.frequency_hz=100"]
 
 
 def plan(block, latency_blocks):
-    compensator = SimpleNamespace(state_size=0)
-    return SimpleNamespace(
-        block=block, latency_blocks=latency_blocks, compensator=compensator,
-        interlocks=SimpleNamespace(aux=()),
-    )  # fmt: skip
+    compensator, interlocks = SimpleNamespace(state_size=0), SimpleNamespace(aux=())
+    axis = SimpleNamespace(compensator=compensator, interlocks=interlocks)
+    return SimpleNamespace(block=block, latency_blocks=latency_blocks), axis
 
 
 def test_time_passes_in_sleeps_only():
@@ -103,30 +101,30 @@ def test_every_block_comes_once_and_in_order(latency):
         firsts.extend(batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist())
         seen.extend(batch.columns[:, 0, 0].tolist())
 
-    host = OfflineHost(plan(2, latency), on_batch=take)
+    lane = OfflineLane(*plan(2, latency), on_batch=take, on_event=None)
     waiting = []
     for number in range(1000):
-        block = host.claim()
+        block = lane.claim()
         block.head[BlockHeader.FIRST_SAMPLE] = 2 * number
         block.reference[:] = number
         waiting.append(block)
         if len(waiting) > latency:
-            assert host.answered(waiting.pop(0))
+            assert lane.answered(waiting.pop(0))
     for block in waiting:
-        host.answered(block)
-    host.flush()
+        lane.answered(block)
+    lane.flush()
     assert firsts == [2 * number for number in range(1000)]
     assert seen == list(range(1000))
 
 
 def test_an_event_comes_after_the_blocks_before_it():
     order = []
-    host = OfflineHost(
-        plan(1, 0), on_batch=lambda batch: order.append(len(batch.heads)),
+    lane = OfflineLane(
+        *plan(1, 0), on_batch=lambda batch: order.append(len(batch.heads)),
         on_event=lambda event: order.append(event.code),
     )  # fmt: skip
-    host.answered(host.claim())
-    host.record_event(Event(1, "info", "tuned", "x"))
+    lane.answered(lane.claim())
+    lane.record_event(Event(1, "info", "tuned", "x"))
     assert order == [1, "tuned"]
 
 
@@ -196,7 +194,7 @@ def test_in_memory_and_in_a_file_it_is_the_same_run(tmp_path):
     recorded = read(run_unpaced(checked, tmp_path / "run.mcap").path).samples
     loaded, begun = checked.loaded, checked.begun
     made = assemble(loaded, checked.reference.values, begun.input_um, begun.state, paced=False)
-    outcome, samples = run_in_memory(made, loaded.device)
+    outcome, [samples] = run_in_memory(made, [loaded.device])
     assert outcome.code == "completed"
     assert samples.index.tolist() == recorded.index.tolist()
     assert samples.command.tobytes() == recorded.command.tobytes()

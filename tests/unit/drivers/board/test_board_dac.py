@@ -14,12 +14,11 @@ from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
-from hilctl.loop.plan import LoopPlan
 from hilctl_drivers.board.board_dac import exchange_time
 from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.transport.framing import binary_framing
-from tests.fakes import FakeHost, made_safe
+from tests.fakes import FakeHost, loop_plan, made_safe
 from tests.unit.drivers.conftest import TIMEOUT_S
 
 pytestmark = pytest.mark.slow  # the board's FIFO runs empty in real time
@@ -156,7 +155,7 @@ def run_loop(driven, n):
     host = FakeHost(SystemClock(), BLOCK)
     limits = CommandLimits(low=-5.0, high=5.0, slew_per_s=1e5, safe=0.0, ramp_per_s=1e3)
     driven.open()
-    plan = LoopPlan(
+    plan = loop_plan(
         reference=sine(n),
         input_um=sine(n),
         block=BLOCK,
@@ -167,7 +166,7 @@ def run_loop(driven, n):
         interlocks=InterlockContext(stroke_um=(-100.0, 100.0)),
         late_policy="follow",
     )
-    return Loop(plan, driven.device, host).run(host.clock.now_ns()), host
+    return Loop(plan, [driven.device], host).run(host.clock.now_ns()), host
 
 
 def test_a_whole_run_loses_nothing(board):

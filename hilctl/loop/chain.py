@@ -1,0 +1,342 @@
+"""One axis of a run: from its reference to its commands, and from its readings to its interlocks.
+
+A chain has no time: the loop calls it in the phases of the run, block by block.
+"""
+
+from collections import deque
+from collections.abc import Callable
+from typing import cast
+
+import numpy as np
+
+from hilctl.base.device import AgingDevice, Device
+from hilctl.base.events import LOST_READINGS, OFFSET, ZERO, Event
+from hilctl.base.samples import ANSWERS, BlockHeader, Flag
+from hilctl.base.types import F64, U32
+from hilctl.loop.block import Block
+from hilctl.loop.interlocks import Interlocks, Trip
+from hilctl.loop.lead_in import LeadIn
+from hilctl.loop.limiter import Limiter
+from hilctl.loop.plan import AxisPlan, Lane
+from hilctl.loop.safe_output import SafeGoal
+from hilctl.loop.tuning import ReferenceTuner, Tuning, TuningFactors, tune
+
+# Plain integers: access to an enumeration's member takes longer than the write.
+_FIRST_SAMPLE, _SAMPLES = int(BlockHeader.FIRST_SAMPLE), int(BlockHeader.SAMPLES)
+_DROPPED_BEFORE, _DEADLINE_NS = int(BlockHeader.DROPPED_BEFORE), int(BlockHeader.DEADLINE_NS)
+_LATE_NS, _EXCHANGE_NS = int(BlockHeader.LATE_NS), int(BlockHeader.EXCHANGE_NS)
+_SKIPPED, _CONDITION = int(Flag.AFTER_SKIPPED), int(Flag.CONDITION)
+_LOST = (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
+
+
+class Chain:
+    """One axis: compensator, limiter, device, interlocks, and what it learns.
+
+    Args:
+        plan: What the axis does.
+        device: Its open device.
+        lane: Where its blocks come from and go to.
+        latency_blocks: Exchanges from a block's commands to its displacements.
+
+    Attributes:
+        block: Block of this tick.
+        limiter: Limiter with the last command.
+        lead_in: What happens before the waveform.
+        invalid: Index of this tick's first requested command that is not finite, or -1.
+        trip: Interlock that the last answer tripped.
+        guarded: Whether that ends the run.
+        no_room_at: First sample of the last answered block, if it had no room.
+        dropped: Samples that had no room.
+    """
+
+    def __init__(
+        self,
+        plan: AxisPlan,
+        device: Device,
+        lane: Lane,
+        *,
+        sample_rate_hz: float,
+        block: int,
+        latency_blocks: int,
+    ) -> None:
+        self.plan, self.device, self.lane = plan, device, lane
+        self.limiter = Limiter(plan.limits, 1.0 / sample_rate_hz)
+        self.lead_in = LeadIn(None, 0)
+        self.block: Block
+        self.invalid = -1
+        self.trip: Trip | None = None
+        self.guarded = True
+        self.no_room_at: int | None = None
+        self.dropped = 0
+        self._interlocks = Interlocks(plan.interlocks, plan.interlock_settings, sample_rate_hz)
+        learners = plan.feedback, plan.adaptation, plan.conditioning
+        self._learns = any(each is not None for each in learners)
+        self._tuner = ReferenceTuner()
+        self._compensator = plan.compensator
+        self._size, self._latency_blocks = block, latency_blocks
+        self._attributes = [name for name, there in _has(device).items() if there]
+        self._in_flight: deque[Block] = deque()
+        self._answered: Block | None = None
+        self._missing = 0  # samples dropped since the last recorded block
+
+    @property
+    def awaits_answer(self) -> bool:
+        """Whether a block that is to be recorded has no answer yet."""
+        return bool(self._in_flight) and self._in_flight[0].due
+
+    @property
+    def next_answer(self) -> int | None:
+        """First sample of the block that is answered next; None if no block is under way."""
+        return self._in_flight[0].head[_FIRST_SAMPLE] if self._in_flight else None
+
+    @property
+    def against(self) -> str:
+        """Why the sensor seems to have the opposite sign of the command; empty otherwise."""
+        return "" if self.plan.feedback is None else self.plan.feedback.against
+
+    def named(self, text: str) -> str:
+        """Return a text with the name of the axis before it, if it has one."""
+        return f"{self.plan.name}: {text}" if self.plan.name else text
+
+    def begin_at(self, output: float) -> int:
+        """Set the present output; return the samples of the ramp to the safe value."""
+        self.limiter.last = output
+        self._interlocks.begin_at(output)
+        return self.limiter.ramp_samples
+
+    def begin_lead_in(self, ramp_samples: int) -> int:
+        """Set the samples of the slowest axis' ramp; return the samples before the waveform."""
+        self.lead_in = LeadIn(self.plan.conditioning, ramp_samples)
+        return self.lead_in.waveform_at
+
+    def pass_over(self, start: int, stop: int) -> None:
+        """Feed the compensator the skipped samples ``start`` to ``stop`` of the waveform.
+
+        Without them its input would jump, and the jump would appear in the command.
+        """
+        plan = self.plan
+        passed = plan.input_um[start:stop].copy()
+        if (factors := self._tuner.advance(passed.size)) is not None:
+            tune(factors, passed, passed)
+        self.lead_in.correct(passed, start)
+        if plan.feedback is not None:
+            passed += plan.feedback.correction_um
+        if plan.adaptation is not None:
+            plan.adaptation.follow(passed, passed.size)
+        self._compensator.process(passed, np.empty_like(passed))
+
+    def reserve(
+        self, first_sample: int, skipped: int, deadline_ns: int, late_ns: int, *, due: bool
+    ) -> Block:
+        """Claim the block of this tick, and write its header and the state before it."""
+        self.block = block = self.lane.claim(due=due)
+        head = block.head
+        head[_FIRST_SAMPLE], head[_SAMPLES] = first_sample, self._size
+        head[_DEADLINE_NS], head[_LATE_NS], head[_EXCHANGE_NS] = deadline_ns, late_ns, 0
+        head[_DROPPED_BEFORE] = block.skipped = skipped
+        if skipped:
+            block.flags |= _SKIPPED
+        # A replay can start from it after any gap.
+        self._compensator.state(block.memory)
+        block.state[-1] = self.limiter.last
+        return block
+
+    def follow(self, start: int) -> None:
+        """Fill the block from sample ``start`` of the waveform on."""
+        block = self.block
+        parts = (block.reference, block.input_um, block.wanted, block.command, block.flags)
+        self.invalid = self._follow(start, *parts)
+
+    def follow_end(self, start: int, n: int) -> None:
+        """Fill the first ``n`` samples of the block with the end of the waveform."""
+        block = self.block
+        parts = (block.reference[:n], block.input_um[:n], block.wanted[:n])
+        self.invalid = self._follow(start, *parts, block.command[:n], block.flags[:n])
+
+    def ramp(self, n: int, *, on_ramp: bool) -> bool:
+        """Fill the samples from ``n`` on with the safe ramp; return whether it has ended."""
+        block = self.block
+        block.reference[n:] = block.input_um[n:] = np.nan
+        block.wanted[n:] = self.limiter.limits.safe
+        return self.limiter.ramp(block.command[n:], block.flags[n:], block.skipped * on_ramp)
+
+    def condition(self, sample: int) -> None:
+        """Fill the block with the conditioning."""
+        block = self.block
+        block.reference[:] = block.input_um[:] = np.nan
+        self.lead_in.condition(block.wanted, sample)
+        block.flags |= _CONDITION
+        self.invalid = self.limiter.limit(block.wanted, block.command, block.flags)
+
+    def hold(self) -> None:
+        """Fill the block with the safe value."""
+        self.block.command[:] = self.limiter.limits.safe
+
+    def send(self) -> None:
+        """Note that the block is about to be sent, so that it survives if the exchange fails."""
+        self._in_flight.append(self.block)
+        if self.block.due:
+            self.lane.sending(self.block)
+
+    def exchange(self, first_sample: int, deadline_ns: int, now_ns: Callable[[], int]) -> None:
+        """Exchange the block with the device."""
+        sent, in_flight = self.block, self._in_flight
+        early = len(in_flight) <= self._latency_blocks
+        answered = sent if early else in_flight[0]
+        head, before_ns = sent.head, now_ns()
+        # The wake-up alone would not show a delay by the work of this tick.
+        head[_LATE_NS] = max(head[_LATE_NS], before_ns - deadline_ns)
+        device = self.device
+        device.exchange(first_sample, sent.command, answered.displacement_um, answered.measured)
+        head[_EXCHANGE_NS] = now_ns() - before_ns
+        for name in self._attributes:
+            getattr(answered, name)[:] = getattr(device, name)
+        self._answered = None if early else in_flight.popleft()
+
+    def take(self) -> bool:
+        """Check an answered block, learn from it, and pass it on to be recorded.
+
+        Return whether an interlock tripped or the block had no room.
+        """
+        if (block := self._answered) is None:
+            return False
+        if self._learns:
+            # Before the interlocks, because it may zero the displacement.
+            self.lead_in.take(block.head[_FIRST_SAMPLE], block.displacement_um)
+        trip = self._interlocks.judge(block)
+        if self._learns:
+            # Before it is recorded: then its slot may be reused.
+            if self.plan.feedback is not None:
+                self.plan.feedback.take(block)
+            if self.plan.adaptation is not None:
+                self.plan.adaptation.take(block)
+        if trip is not None:
+            self.trip, self.guarded = trip, block.guarded
+        # Before a fault is recorded: its event refers to recorded samples.
+        return not self._pass_on(block) or trip is not None
+
+    def remove_offset(self, sample: int) -> str:
+        """Remove the offset between sensor and model; return why the run must end, if it must.
+
+        ``sample`` is the next one.
+        """
+        text, values, refused = self.lead_in.remove_offset()
+        if self.plan.adaptation is not None:
+            self.plan.adaptation.take_noise(self.lead_in.noise_um)
+        if refused:
+            return text
+        if self.lead_in.zero_um is not None:
+            self._interlocks.zero(self.lead_in.zero_um)
+            # Of the next answer, which may still belong to the rest.
+            first = sample if self.next_answer is None else self.next_answer
+            self.lane.record_event(Event(first, "info", ZERO, text, values))
+        elif text:
+            self.lane.record_event(Event(sample, "info", OFFSET, text, values))
+        return ""
+
+    def tune(self, tuning: Tuning, sample: int) -> None:
+        """Begin a requested change of the reference."""
+        for event in self._tuner.events(tuning, sample):
+            self.lane.record_event(event)
+        self._tuner.move(tuning)
+
+    def record_ramp(self) -> None:
+        """Record the initial ramp, if there is one."""
+        limiter = self.limiter
+        if not limiter.at_rest:
+            event = self.lead_in.ramp_event(limiter.last, limiter.limits.safe)
+            self.lane.record_event(event)
+
+    def record_condition(self) -> None:
+        """Record the start of the conditioning, if there is one."""
+        if (event := self.lead_in.condition_event()) is not None:
+            self.lane.record_event(event)
+
+    def record_adapted(self, sample: int, *, ended: bool = False) -> None:
+        """Record the adapted parameters if they have changed enough or the run has ended."""
+        adaptation = self.plan.adaptation
+        if adaptation is not None and (event := adaptation.event(sample, ended=ended)):
+            self.lane.record_event(event)
+
+    def record_lost_readings(self, sample: int) -> None:
+        """Record how many readings of the sensor did not arrive."""
+        ages = self.device.info.ages_readings
+        if ages and (lost := cast(AgingDevice, self.device).lost_readings):
+            text = f"{lost} readings of the sensor did not arrive"
+            values = {"readings": float(lost)}
+            self.lane.record_event(Event(sample, "warning", LOST_READINGS, text, values))
+
+    def safe_goal(self) -> SafeGoal:
+        """Return how to reach the safe value from the last command after a lost device."""
+        limits = self.limiter.limits
+        unanswered = not self.device.info.simulated
+        return SafeGoal(limits.safe, limits.ramp_per_s, self.limiter.last, unanswered)
+
+    def pass_on_unanswered(self) -> None:
+        """Pass on the blocks of a lost device, marked as unanswered."""
+        if self._answered is not None:
+            self._pass_on(self._answered)
+        for block in self._in_flight:
+            if block.due:
+                block.columns[ANSWERS] = block.aux[:] = np.nan
+                block.flags |= _LOST
+                self._pass_on(block)
+
+    def _pass_on(self, block: Block) -> bool:
+        """Pass a block on to be recorded, with the samples dropped before it."""
+        self._answered = None
+        block.head[_DROPPED_BEFORE] = before = self._missing + block.skipped
+        if self.lane.answered(block):
+            self._missing = 0
+            return True
+        self._missing = before + self._size
+        self.dropped += self._size
+        self.no_room_at = block.head[_FIRST_SAMPLE]
+        return False
+
+    def _follow(
+        self,
+        start: int,
+        reference: F64,
+        input_um: F64,
+        wanted: F64,
+        command: F64,
+        flags: U32,
+    ) -> int:
+        tuner = self._tuner
+        factors = None if tuner.idle else tuner.advance(wanted.size)
+        self._fill_input(factors, reference, input_um, start)
+        self._compensator.process(input_um, wanted)
+        # After the compensator, whose state evolves as if its command were applied.
+        if factors is not None:
+            tuner.fade(factors, reference, wanted, flags)
+        return self.limiter.limit(wanted, command, flags)
+
+    def _fill_input(
+        self, factors: TuningFactors | None, reference: F64, input_um: F64, start: int
+    ) -> None:
+        """Fill reference and input from sample ``start`` of the waveform on."""
+        plan, stop = self.plan, start + reference.size
+        if factors is None:
+            reference[:] = plan.reference[start:stop]
+            own = plan.input_um is not plan.reference
+            input_um[:] = plan.input_um[start:stop] if own else reference
+        else:
+            tune(factors, plan.reference[start:stop], reference)
+            tune(factors, plan.input_um[start:stop], input_um)
+        self.lead_in.correct(input_um, start)
+        if plan.feedback is not None:
+            plan.feedback.follow(self.block, input_um)
+        # Last: it adds the adapted offset and gain, and learns from the input without them.
+        if plan.adaptation is not None:
+            plan.adaptation.follow(input_um, self._size)
+
+
+def _has(device: Device) -> dict[str, bool]:
+    """Return the attributes of a device that an exchange may fill."""
+    info = device.info
+    return {
+        "reading_age_s": info.ages_readings,
+        "reading_um": info.corrects_readings,
+        "aux": bool(info.aux),
+    }
