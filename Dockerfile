@@ -7,8 +7,8 @@
 FROM python:3.11-slim-bookworm AS build
 RUN apt-get update && apt-get install --yes --no-install-recommends gcc libc6-dev && rm -rf /var/lib/apt/lists/*
 RUN python -m venv /opt/hilctl
-COPY requirements.txt /src/
-RUN /opt/hilctl/bin/pip install --no-cache-dir --require-hashes --requirement /src/requirements.txt
+COPY requirements/core.txt /src/
+RUN /opt/hilctl/bin/pip install --no-cache-dir --require-hashes --requirement /src/core.txt
 COPY . /src
 RUN /opt/hilctl/bin/pip install --no-cache-dir --no-deps --no-build-isolation /src
 

@@ -54,10 +54,10 @@ cp /etc/ssl/certs/ca-certificates.crt "$root/etc/ssl/certs/"  # with those that 
 mkdir "$root/src"
 git ls-files -z | tar --create --null --files-from=- | tar --extract --directory="$root/src"
 
-step "install requirements.txt"
+step "install requirements/core.txt"
 inside 'uname --machine
 python3 -m venv .venv
-pip --disable-pip-version-check install --quiet --require-hashes --requirement requirements.txt
+pip --disable-pip-version-check install --quiet --require-hashes --requirement requirements/core.txt
 pip --disable-pip-version-check install --quiet --no-deps --no-build-isolation --editable .'
 
 step "replay the golden recordings"
@@ -66,6 +66,6 @@ inside 'for each in recordings/golden/*.mcap; do hilctl replay "$each"; done'
 step "a paced run of two seconds"
 # The emulated processor is slow, and its clock is this machine's: late ticks end nothing here.
 inside 'hilctl run configs/demo.yaml --output demo.mcap --set waveform.duration_s=2.0 \
-    --set timing.on_misses=warn --set timing.max_late_s=30.0 --set timing.max_consecutive_late=0
+    --set timing.on_misses=warn --set timing.max_late_s=30.0
 hilctl replay demo.mcap'
 step "done"

@@ -10,8 +10,7 @@ import pytest
 from tests.documents.walkthrough import ROOT, Step, pattern, steps_of, walk
 
 NEEDED = (
-    "Makefile", "README.md", "configs", "docs", "pyproject.toml",
-    *(path.name for path in ROOT.glob("requirements*.txt")),
+    "Makefile", "README.md", "configs", "docs", "pyproject.toml", "requirements",
 )  # fmt: skip
 """What the commands read; code is imported from where it is, whose kernels are compiled already."""
 

@@ -22,7 +22,7 @@ GIVE_UP_S = 240.0
 
 DEBIAN = "apt-get install {}"
 NPM = "npm ci --prefix tests/peers"
-PYTHON = "pip install -e '.[dev]'"
+PYTHON = "pip install --group dev"
 
 
 def missing(what: str, remedy: str) -> None:
