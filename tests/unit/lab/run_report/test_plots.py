@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import numpy as np
 import pytest
-from matplotlib.collections import FillBetweenPolyCollection
+from matplotlib.collections import PolyCollection
 
 from hilctl.base.segments import Segment
 from hilctl.lab.pages import plot_style
@@ -43,7 +43,7 @@ def lines(axes) -> dict[str, object]:
 class TestTimeHistory:
     def test_many_cycles_are_a_band(self, run) -> None:
         upper = drawn(plots.time_history(run(cycles=400))).axes[0]
-        bands = [c for c in upper.collections if isinstance(c, FillBetweenPolyCollection)]
+        bands = [c for c in upper.collections if isinstance(c, PolyCollection)]
         assert len(bands) == 1
         heights = bands[0].get_paths()[0].vertices[:, 1]
         assert np.abs(np.abs(heights) - 40.0).max() < 0.01
