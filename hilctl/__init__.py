@@ -27,7 +27,7 @@ Devices are in ``hilctl_drivers``, which imports ``base`` and ``kernels`` only.
 import sys
 import time
 
-__version__ = "0.2.0"
+__version__ = "0.3.0"
 
 # The matrices here are small: more BLAS threads make a fit many times slower on a busy machine, and
 # the loop's process must not have any. It takes effect where numpy is not imported yet.
