@@ -13,7 +13,7 @@ from pathlib import Path
 from typing import Any
 
 from hilctl import api
-from hilctl.cli.commands import COMMANDS, load
+from hilctl.cli.commands import COMMANDS, GROUPS, load
 from hilctl.lab.pages.html import DEFINITIONS
 
 ROOT = Path(__file__).parents[1]
@@ -175,15 +175,17 @@ def _kind(value: dict[str, Any]) -> str:
 
 
 def commands_page() -> str:
-    """Return one section per command with its help."""
-    return "\n".join(map(_command, COMMANDS))
+    """Return one section per group of commands, with the help of each command."""
+    return "\n".join(
+        "\n".join((f"## {group}\n", *map(_command, names))) for group, names in GROUPS.items()
+    )
 
 
 def _command(name: str) -> str:
     inner = getattr(load(name), "commands", {})
-    blocks = [f"## {name}\n", _typer(name, f"hilctl {name}")]
+    blocks = [f"### {name}\n", _typer(name, f"hilctl {name}")]
     for each in inner:
-        blocks += [f"### {name} {each}\n", _typer(f"{name}:{each}", f"hilctl {name} {each}")]
+        blocks += [f"#### {name} {each}\n", _typer(f"{name}:{each}", f"hilctl {name} {each}")]
     return "\n".join(blocks)
 
 
