@@ -59,6 +59,11 @@ class ConfigProblem:
         return text
 
 
+def broken(key: str, rule: str, value: str = "", hint: str = "") -> ConfigProblem:
+    """Return a broken rule whose place in the file is not known yet."""
+    return ConfigProblem("", key, rule, value, hint)
+
+
 class ConfigError(InputError):
     """An experiment or model file breaks one or more rules; all of them are listed."""
 

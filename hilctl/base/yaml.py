@@ -21,6 +21,7 @@ import types
 import typing
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeAlias, TypeVar
 
@@ -504,6 +505,10 @@ class Document:
     def problem(self, key: str, rule: str, value: str = "", hint: str = "") -> ConfigProblem:
         """Return a broken rule with the place of its dotted key."""
         return ConfigProblem(self.where(loc_of(key)), key, rule, value, hint)
+
+    def refusal(self, problems: Iterable[ConfigProblem]) -> ConfigError:
+        """Return the error of broken rules, each with the place of its key."""
+        return ConfigError(replace(each, where=self.where(loc_of(each.key))) for each in problems)
 
     def validate(
         self,

@@ -27,8 +27,7 @@ from hilctl.cli.console import compile_progress, console, listing, progress_bar
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import Verbosity, print_json, print_result
 from hilctl.cli.reports import render_report
-from hilctl.experiment.device_rules import interlock_context
-from hilctl.experiment.file import label_settings
+from hilctl.experiment.labels import label_settings
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.interlocks import for_longer_than
 from hilctl.loop.safe_output import describe
@@ -293,11 +292,11 @@ def _forecast_rows(checked: CheckedExperiment) -> dict[str, str]:
 def _supervised_rows(checked: CheckedExperiment) -> dict[str, str]:
     """Return what interlocks, trigger and device add to the forecast."""
     forecast, config, rows = checked.forecast, checked.loaded.config, {}
-    info, interlocks = checked.loaded.device.info, config.interlocks
+    info, interlocks = checked.loaded.device.info, checked.loaded.rig.interlocks
     if interlocks.tracking_error_um is not None:
         more = f"more{for_longer_than(interlocks.tracking_s)} ends the run"
         rows["tracking error"] = f"at most {interlocks.tracking_error_um:g} µm; {more}"
-    if aux := interlock_context(config, info).aux:
+    if aux := checked.loaded.rig.aux:
         rows["auxiliary"] = "; ".join(f"{each.channel.name}: {each}" for each in aux)
     if (trigger := _trigger(checked)) is not None:
         rows["trigger"] = _trigger_text(trigger, config.tick_s)

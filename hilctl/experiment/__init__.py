@@ -1,8 +1,9 @@
 """The experiment file, everything it refers to, and its check before a run. Moves nothing."""
 
 PUBLIC = (
-    "closed_loop", "coil_heat", "conditioning", "correction", "device_rules", "device_state",
-    "devices", "examples", "file", "forecast", "load", "model_validity", "open_loop", "preflight",
-    "state_files", "template",
+    "adaptation", "coil_heat", "compensator", "conditioning", "correction", "device_state",
+    "devices", "examples", "feedback", "file", "forecast", "labels", "load", "model_validity",
+    "open_loop", "preflight", "recording_settings", "rig", "safe", "state_files", "template",
+    "timing",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -11,9 +11,9 @@ import numpy as np
 
 from hilctl.base.samples import Flag, Samples
 from hilctl.base.types import F64
-from hilctl.experiment.file import Experiment, Limits
+from hilctl.experiment.rig import RunRig
 from hilctl.kernels.interlock import heat_block
-from hilctl.loop.interlocks import warming
+from hilctl.loop.interlocks import InterlockSettings, warming
 
 _ROOM = 0.9  # of the budget, for measured currents: one sample late, in addition to the commands
 _LEAST_DIFFERENCE = 1e-3
@@ -28,7 +28,7 @@ class CoilHeat:
         used_s: Time of the commands after which the budget is exceeded; None if it never is.
     """
 
-    def __init__(self, limits: Limits, sample_rate_hz: float, heat_a2: float) -> None:
+    def __init__(self, limits: InterlockSettings, sample_rate_hz: float, heat_a2: float) -> None:
         self._rate_hz = sample_rate_hz
         self._budget_a2 = (limits.rms_current_a or math.inf) ** 2
         self._tau_s = limits.thermal_time_constant_s
@@ -112,9 +112,9 @@ class RunHeat:
 class CoolingCoil:
     """Heat of a coil through runs and pauses; constant without a thermal budget."""
 
-    def __init__(self, config: Experiment, heat_a2: float, now_s: float) -> None:
-        self._tau_s = config.limits.thermal_time_constant_s
-        self._rest = config.safe.value
+    def __init__(self, rig: RunRig, heat_a2: float, now_s: float) -> None:
+        self._tau_s = rig.interlocks.thermal_time_constant_s
+        self._rest = rig.command.safe
         self._heat_a2 = max(heat_a2, self._rest**2)
         self._at_s = now_s
 

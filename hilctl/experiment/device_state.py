@@ -1,27 +1,27 @@
 """The state that the last run of an output left: memory of the actuator, heat of the coil.
 
-A compensator starts at rest, or with the memory that earlier commands left. A file names the run
-(:mod:`hilctl.experiment.state_files`), so that copying or recovering an old recording does not
-change which run was the last. Simulated devices have no file and start at rest.
+A file names the run (:mod:`hilctl.experiment.state_files`), so that copying or recovering an old
+recording does not change which run was the last. Simulated devices have no file and start at rest.
 """
 
 import json
 import math
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterator, Mapping
 from contextlib import suppress
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from datetime import UTC, datetime
 from itertools import chain
 from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.errors import DataError
+from hilctl.base.errors import ConfigProblem, DataError, InputError, broken
 from hilctl.base.samples import Flag
-from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.experiment.coil_heat import CoilHeat, cooled
-from hilctl.experiment.file import Experiment, Limits
+from hilctl.experiment.compensator import CompensatorStart, InitialState, begin, left_by
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.limits import Limits
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.state_files import (
     CoilState,
@@ -32,86 +32,69 @@ from hilctl.experiment.state_files import (
     state_of_run,
     write_state,
 )
-from hilctl.loop.compensator import Compensator
-from hilctl.models.base import HysteresisModel, Operator
+from hilctl.models.base import HysteresisModel
 from hilctl.recording.metadata_keys import HEAT_FACT
 from hilctl.recording.run_summary import read_ends
-
-_STILL_S = 1.0
-_AT_REST_S = 0.1  # after which the stages of any actuator are at rest
-_FEWEST_SAMPLES = 16  # which a delay and a preview need at a low rate
-_FIRST_STEP_UM = 1e-4
-_SETTLED_UM = 1e-9
-_MOST_STEPS = 20
+from hilctl.waveforms.build import Reference
 
 
-@dataclass(frozen=True, slots=True)
-class CompensatorStart:
-    """Input and initial state of the compensator of a run."""
+def start_of(
+    loaded: LoadedExperiment, reference: Reference, conditioned: F64, now: MachineTime
+) -> tuple[CompensatorStart, list[ConfigProblem]]:
+    """Return input and initial state of the compensator, and the problems if one is unknown.
 
-    input_um: F64  # float64[n], its input; the reference itself if nothing is added
-    preview: int  # samples by which its input runs ahead of the commands
-    state_size: int  # numbers in its memory
-    state: F64 | None = None  # float64[state_size], before the first sample; None at rest
-    begins: str = "at rest"  # origin of the initial state in words
-    run_id: str = ""  # the run that left this memory; empty if none did
-    stands_um: float | None = None  # modelled before the first sample, to measure the offset
-
-
-@dataclass(frozen=True, slots=True)
-class InitialState:
-    """State of the actuator after earlier commands."""
-
-    state: F64  # float64[state_size], the compensator's memory
-    stands_um: float  # displacement by the model
-    run_id: str  # the run of those commands; empty for the present one
-
-    def lead_in(self, input_um: F64, samples: int) -> F64:
-        """Return the input, float64[n], led in over ``samples`` from the displacement."""
-        away_um = self.stands_um - float(input_um[0])
-        led = input_um.copy()
-        part = np.arange(min(samples, input_um.size)) / samples
-        led[: part.size] += 0.5 * (1.0 + np.cos(np.pi * part)) * away_um
-        return led
-
-
-def begin(
-    model: HysteresisModel | None,
-    sample_rate_hz: float,
-    values: F64,
-    before: InitialState | None = None,
-    begins: str = "at rest",
-    last: Segment | None = None,
-) -> CompensatorStart:
-    """Return input and initial state of a compensator.
-
-    ``values``, float64[n], is the reference with correction and lead-in, and ``before`` the state
-    of the actuator (None at rest) with its origin ``begins`` in words. ``last`` is the last
-    waveform, see :meth:`Compensator.ahead`.
-
-    Raises:
-        ModelError: The model has no inverse.
+    ``conditioned``, float64[m], are the commands before the waveform. Raise ModelError if the model
+    has no inverse.
     """
-    compensator = Compensator(model, sample_rate_hz)
+    config = loaded.config
+    problems: list[ConfigProblem] = []
+    values = reference.values
+    if loaded.correction is not None:
+        try:
+            values = loaded.correction.added(reference, loaded.model)
+        except InputError as error:
+            hint = "learn again with 'hilctl learn', or remove it"
+            problems.append(broken("compensator.correction", str(error), hint=hint))
+    before, begins = None, ""
+    try:
+        before, begins = _state_before(loaded, conditioned, now)
+    except DataError as error:
+        problems.append(broken("compensator.initial_state", str(error)))
     if before is not None:
-        compensator.restore(before.state)
-    compensator.begin(values)
-    state = compensator.state()
-    return CompensatorStart(
-        input_um=compensator.ahead(values, last),
-        preview=compensator.preview,
-        state_size=state.size,
-        state=state if before is not None or compensator.preview else None,
-        begins=begins,
-        run_id=before.run_id if before else "",
-        stands_um=before.stands_um if before else None,
-    )
+        # With a soft start of this length, it becomes one from where the actuator stands.
+        soft = reference.segments[0].steady_start
+        values = before.lead_in(values, max(loaded.rig.lead_in_samples, soft))
+    last = reference.segments[-1]
+    begun = begin(loaded.model, config.sample_rate_hz, values, before, begins, last)
+    if config.zero and loaded.model is None:
+        return replace(begun, stands_um=0.0), problems
+    known = config.zero or config.measures_offset
+    return (begun if known else replace(begun, stands_um=None)), problems
 
 
-def rests_at(model: HysteresisModel, sample_rate_hz: float, command: float) -> float:
-    """Return the displacement at rest at a command that was never exceeded, in um."""
-    samples = max(round(_AT_REST_S * sample_rate_hz), 1)
-    return float(model.forward(sample_rate_hz).process(np.full(samples, command))[-1])
+def _state_before(
+    loaded: LoadedExperiment, conditioned: F64, now: MachineTime
+) -> tuple[InitialState | None, str]:
+    """Return the actuator's state before the waveform (None at rest) and its origin in words.
+
+    Raise DataError if the recording that the experiment names does not tell it.
+    """
+    config, model = loaded.config, loaded.model
+    if model is None or config.compensator is None:
+        return None, ""
+    rate_hz, named = config.sample_rate_hz, config.compensator.initial_state
+    before, begins = None, "at rest"
+    if config.condition is not None:
+        begins = "where its condition leaves the actuator"
+    elif named == "last":
+        before, begins = left_by_last_run(loaded, now)
+    elif named != "rest":
+        begins = f"where {named} left the actuator"
+        path = loaded.folder / named
+        before = initial_state_after(path, model, rate_hz, now.unix_s, config.safe.value)
+    if before is None and conditioned.size:
+        before = left_by([conditioned], model, rate_hz)
+    return before, begins
 
 
 def initial_state_after(
@@ -136,73 +119,6 @@ def initial_state_after(
     if not math.isfinite(left.stands_um):
         raise DataError(f"{path}: has commands beyond the range of the model")
     return replace(left, run_id=ends.run.get("run_id", ""))
-
-
-def left_by(
-    commands: Iterable[F64],
-    model: HysteresisModel,
-    sample_rate_hz: float,
-    stood_s: float | None = None,
-) -> InitialState:
-    """Return the state of a model after commands from rest, float64[n] each, in order.
-
-    ``stood_s`` is the time since the commands, of which at least one second is simulated;
-    without it they must end with a rest.
-    """
-    forward, inverse = model.forward(sample_rate_hz), model.inverse(sample_rate_hz)
-    rest = inverse.state()
-    ahead, stands_um, last = inverse.preview, 0.0, 0.0
-    still = 0 if stood_s is None else round(_STILL_S * sample_rate_hz)
-    for command in _and_still(commands, still):
-        came = forward.process(command)
-        if not np.isfinite(came).all():
-            return InitialState(rest, math.nan, "")
-        if came.size > ahead:
-            inverse.process(came[ahead:])
-        ahead, stands_um, last = max(ahead - came.size, 0), float(came[-1]), float(command[-1])
-    if stood_s is not None and (more_s := stood_s - _STILL_S) > 0.0:
-        forward.stand(more_s)
-        inverse.stand(more_s)
-        stands_um = float(forward.process(np.array([last]))[0])
-    samples = max(round(_AT_REST_S * sample_rate_hz), _FEWEST_SAMPLES)
-    stands_um = _settle(inverse, stands_um, last, samples)
-    return InitialState(inverse.state(), stands_um, "")
-
-
-def _settle(inverse: Operator, near_um: float, command: float, samples: int) -> float:
-    """Settle an inverse where it holds a command, near a displacement; return its displacement.
-
-    An inverse is inexact at steps of the command, such as those of missing samples. Without this, a
-    run would begin with a step from the command that the actuator is at.
-    """
-    state = inverse.state()
-
-    def off(um: float) -> float:
-        inverse.restore(state)
-        return float(inverse.process(np.full(samples, um))[-1]) - command
-
-    um, step_um = near_um, _FIRST_STEP_UM
-    now = first = off(um)
-    for _ in range(_MOST_STEPS):  # of the secant method
-        um, before, now = um + step_um, now, off(um + step_um)
-        if now == before or abs(step_um) < _SETTLED_UM:
-            break
-        step_um *= now / (before - now)
-    if abs(now) < abs(first):
-        return um
-    inverse.restore(state)
-    return near_um
-
-
-def _and_still(commands: Iterable[F64], samples: int) -> Iterator[F64]:
-    """Yield commands, then the last one for a number of samples."""
-    last = 0.0
-    for command in commands:
-        if command.size:
-            yield command
-            last = float(command[-1])
-    if samples:
-        yield np.full(samples, last)
 
 
 def _recorded_commands(path: Path, unit: str, sample_rate_hz: float) -> Iterator[F64]:

@@ -13,22 +13,15 @@ import numpy as np
 
 from hilctl.base.types import CHUNK, F64
 from hilctl.experiment.coil_heat import CoilHeat, RunHeat
-from hilctl.experiment.device_state import CompensatorStart
-from hilctl.experiment.file import Experiment
-from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.compensator import CompensatorStart
+from hilctl.experiment.rig import RunRig
 from hilctl.kernels.dynamics import lag_block
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import LinearBypass
+from hilctl.models.base import HysteresisModel
 from hilctl.waveforms.build import Reference, RepeatedPart
 from hilctl.waveforms.shapes import LONG
 
-_FILE_BYTES = 15e3  # description, model and message schemas
-_SAMPLE_BYTES = 6.0  # time, displacement and measured command: what their noise leaves
-_NEW_BYTES = 13.0  # a value of reference or command that its chunk does not contain yet
-_SCOPE_BYTES = 48.0  # a message of ``/scope``
-_TICK_BYTES = 11.0
-_CHUNK_SAMPLES = 90_000  # in a full chunk, which is compressed as a whole
-_COUNTED_CHUNKS = 4
 _MOST_PERIODS = 1024
 _LEAST_CYCLE = 65_536
 """Least samples of a compared cycle; comparing shorter ones one by one would be slow."""
@@ -73,12 +66,14 @@ class Forecast:
 
 
 def forecast_of(
-    loaded: LoadedExperiment,
+    rig: RunRig,
+    model: HysteresisModel | None,
     reference: Reference,
     begun: CompensatorStart,
     conditioned: F64,
     heat_a2: float = 0.0,
     input_um: Callable[[int, int], F64] | None = None,
+    recording_mb: float = 0.0,
 ) -> Forecast:
     """Compute all commands of a run: ``conditioned``, float64[m], then those of the waveform.
 
@@ -88,12 +83,12 @@ def forecast_of(
     Raises:
         ModelError: The model has no inverse.
     """
-    config, info = loaded.config, loaded.device.info
-    compensator = Compensator(loaded.model, config.sample_rate_hz)
+    info, rate_hz, safe = rig.info, rig.exchange.rate_hz, rig.command.safe
+    compensator = Compensator(model, rate_hz)
     if begun.state is not None:
         compensator.restore(begun.state)
-    heat_a2 = max(heat_a2, config.safe.value**2)
-    command, ends = CommandFigures(config, config.safe.value, heat_a2), LineEnds()
+    heat_a2 = max(heat_a2, safe**2)
+    command, ends = CommandFigures(rig, safe, heat_a2), LineEnds()
     if conditioned.size:
         command.add(conditioned)
     values = reference.values
@@ -111,8 +106,8 @@ def forecast_of(
     lowest_at_s, highest_at_s, fastest_at_s, voltage_at_s = command.places_s
     return Forecast(
         samples=values.size,
-        duration_s=values.size / config.sample_rate_hz,
-        before_s=conditioned.size / config.sample_rate_hz,
+        duration_s=values.size / rate_hz,
+        before_s=conditioned.size / rate_hz,
         begins=begun.begins,
         reference_min=low,
         reference_max=high,
@@ -123,38 +118,18 @@ def forecast_of(
         lowest_at_s=lowest_at_s,
         highest_at_s=highest_at_s,
         fastest_at_s=fastest_at_s,
-        voltage_v=None if config.amplifier is None else command.voltage_v,
+        voltage_v=None if rig.amplifier is None else command.voltage_v,
         voltage_at_s=voltage_at_s,
         heat=heat.effect,
         begins_rms_a=None if heat.rms_a is None else math.sqrt(heat_a2),
         heating_rms_a=heat.rms_a,
         budget_used_s=heat.used_s,
-        recording_mb=_recording_bytes(config, reference, conditioned.size) * 1e-6,
+        recording_mb=recording_mb,
         highest_rate_hz=info.max_rate_hz,
         rate_note=info.rate_note,
         first_command=ends.first,
-        line=None if loaded.model is None else ends.line(),
+        line=None if model is None else ends.line(),
     )
-
-
-def _recording_bytes(config: Experiment, reference: Reference, before: int) -> float:
-    """Return the size of the compressed recording; measured sizes are within 30 % of it.
-
-    Values that repeat within a chunk take almost no space, so the share of new ones decides.
-    """
-    values, rate_hz = reference.values, config.sample_rate_hz
-    samples = values.size + before
-    chunk = max(1, min(values.size, _CHUNK_SAMPLES, round(config.recording.flush_s * rate_hz)))
-    columns, new = 1 + (reference.unit == "um"), 1.0
-    if config.feedback is not None or config.adaptation is not None:
-        columns += 1  # the noise of the sensor is in input and command
-    else:
-        starts = np.linspace(0, values.size - chunk, _COUNTED_CHUNKS).astype(int).tolist()
-        counts = [np.unique(values[start : start + chunk]).size for start in starts]
-        new = sum(counts) / (len(counts) * chunk)
-    scope = min(1.0, config.recording.scope_rate_hz / rate_hz)
-    each = _SAMPLE_BYTES + _NEW_BYTES * columns * new + _SCOPE_BYTES * scope
-    return _FILE_BYTES + samples * (each + _TICK_BYTES / config.block)
 
 
 def simulate_commands(
@@ -227,14 +202,14 @@ class CommandFigures:
         voltage_v: Largest magnitude of the amplifier's voltage; 0 without its limit.
     """
 
-    def __init__(self, config: Experiment, last: float, heat_a2: float) -> None:
+    def __init__(self, rig: RunRig, last: float, heat_a2: float) -> None:
         self.last = last
         self.low = self.high = last
-        self.heat = CoilHeat(config.limits, config.sample_rate_hz, heat_a2)
-        self._rate_hz = config.sample_rate_hz
+        self._rate_hz = rig.exchange.rate_hz
+        self.heat = CoilHeat(rig.interlocks, self._rate_hz, heat_a2)
         self._step = 0.0
         self._samples = 0
-        self._amplifier = config.amplifier
+        self._amplifier = rig.amplifier
         self._current = last
         self._lag = np.full(2, last)  # memory of the current loop
         self.voltage_v = 0.0
@@ -321,17 +296,3 @@ class LineEnds:
         slope = math.copysign(rise, at_high - at_low) / (high_um - low_um)
         middle_um = 0.5 * (low_um + high_um)
         return LinearBypass(slope, 0.5 * (self._lowest + self._highest) - slope * middle_um)
-
-
-def fade_refusal(loaded: LoadedExperiment, line: LinearBypass | None, wanted: str) -> str:
-    """Return why the inverse cannot be bypassed (``out``) or enabled (``in``), or an empty text."""
-    if loaded.model is None:
-        return "the experiment has no compensator: there is no inverse to bypass"
-    if line is None:
-        return "the reference is constant: there is no line through its ends"
-    if wanted == "out" and loaded.config.limits.tracking_error_um is not None:
-        return (
-            "limits.tracking_error_um would end the run, because the displacement leaves its "
-            "reference without the inverse: remove that limit from the experiment first"
-        )
-    return ""

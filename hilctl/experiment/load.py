@@ -8,14 +8,18 @@ from pathlib import Path
 from typing import TypeVar
 
 from hilctl.base.device import Device
-from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
 from hilctl.base.files import TextFiles, is_file
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document, dump, load_document, loc_of
+from hilctl.experiment.conditioning import make_conditioning
 from hilctl.experiment.correction import Correction, load_correction
 from hilctl.experiment.devices import made_device
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.open_loop import MeasuredResponse, load_response
+from hilctl.experiment.rig import RunRig
+from hilctl.experiment.safe import safe_problems
+from hilctl.loop.lead_in import Conditioning
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import load_model
 
@@ -50,6 +54,26 @@ class LoadedExperiment:
     correction: Correction | None = None
     response: MeasuredResponse | None = None
     files: TextFiles = field(default_factory=TextFiles)
+
+    @property
+    def rig(self) -> RunRig:
+        """What the sections share of device, rate and limits."""
+        return self.config.rig(self.device.info)
+
+    def conditioning(self, stands_um: float | None = None) -> Conditioning | None:
+        """Return the conditioning before the waveform, or None.
+
+        ``stands_um`` is the model's displacement at its end; None if no offset is measured. Raise
+        InputError if it is too long.
+        """
+        config = self.config
+        return make_conditioning(
+            config.condition,
+            self.rig,
+            zero=config.zero,
+            offset=config.measures_offset,
+            stands_um=stands_um,
+        )
 
     def problem(self, key: str, rule: str, value: str = "", hint: str = "") -> ConfigProblem:
         """Return a broken rule with the place of its key in the file."""
@@ -136,7 +160,7 @@ def resolve(
     correction = _collect(problems, lambda: named("compensator.correction", load_correction))
     response = _collect(problems, lambda: named("feedback.response", load_response))
     if config is not None:
-        problems += _joint_problems(config, document)
+        problems += document.refusal(_joint_problems(config)).problems
     if problems or config is None or device is None:
         raise ConfigError(problems)
     yaml_text = dump(document.data)
@@ -145,22 +169,19 @@ def resolve(
     )
 
 
-def _joint_problems(config: Experiment, document: Document) -> Iterator[ConfigProblem]:
+def _joint_problems(config: Experiment) -> Iterator[ConfigProblem]:
     """Yield broken rules between sections of the experiment."""
     unit, limits = config.waveform.unit, config.limits
     if unit is None:
-        yield document.problem("waveform.unit", "is required", hint="um, A or V")
+        yield broken("waveform.unit", "is required", hint="um, A or V")
     elif config.compensator is not None and unit != "um":
-        yield document.problem("waveform.unit", "must be um with a compensator", unit)
+        yield broken("waveform.unit", "must be um with a compensator", unit)
     elif config.compensator is None and unit != limits.unit:
         rule = f"must be {limits.unit}, the unit of the limits, without a compensator"
-        yield document.problem("waveform.unit", rule, unit)
+        yield broken("waveform.unit", rule, unit)
     if config.amplifier is not None and limits.unit != "A":
-        yield document.problem("amplifier", "is for a device driven in A", hint="remove it")
-    low, high = limits.command_range
-    if not low <= config.safe.value <= high:
-        rule = f"must lie within the limits, {low:g} to {high:g} {limits.unit}"
-        yield document.problem("safe.value", rule, f"{config.safe.value:g}")
+        yield broken("amplifier", "is for a device driven in A", hint="remove it")
+    yield from safe_problems(config.safe, *limits.command_range, limits.unit)
 
 
 def _collect(problems: list[ConfigProblem], load: Callable[[], T]) -> T | None:

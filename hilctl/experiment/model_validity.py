@@ -5,6 +5,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
+from hilctl.base.errors import ConfigProblem, broken
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, chunks
 from hilctl.models.base import SMALLEST_STROKE, IdentifiedRange, Provenance, stroke_class
@@ -46,7 +47,7 @@ class ExpectedError:
 class RangeFindings:
     """Comparison of a reference with the motions a model was identified on."""
 
-    refused: tuple[str, ...] = ()  # reasons to reject the run
+    refused: tuple[ConfigProblem, ...] = ()  # reasons to reject the run
     warnings: tuple[str, ...] = ()  # reasons why the model error is unknown
     expected: ExpectedError | None = None  # None if it is unknown
 
@@ -93,6 +94,7 @@ def _lines(batch: F64) -> F64:
     return lines
 
 
+_CURE = "identify the model on such motions, or keep the waveform within those it was fitted on"
 UNKNOWN = (
     "compensator.model has no provenance.identified_range, so its error on this reference is "
     "unknown: identify it again, or add the range that it was identified on"
@@ -113,7 +115,7 @@ def range_findings(provenance: Provenance, reference: Reference) -> RangeFinding
             f"the reference moves at about {found.main_hz:.3g} Hz, and the model was identified "
             f"on {_span(low_hz, high_hz)} Hz"
         )
-        return RangeFindings(refused=(text,))
+        return RangeFindings(refused=(broken("waveform", text, hint=_CURE),))
     warnings = list(_motion_warnings(known, reference))
     if found.highest_hz > MARGIN * high_hz + found.resolution_hz:
         warnings.append(

@@ -8,7 +8,7 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass
 from pathlib import Path
-from typing import Annotated, NamedTuple, Self
+from typing import Annotated, Self
 
 import numpy as np
 
@@ -17,6 +17,7 @@ from hilctl.base.files import TextFiles, write_text
 from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import F64
 from hilctl.base.yaml import commented, load_document
+from hilctl.experiment.rig import Exchange
 from hilctl.loop.feedback import Gains
 from hilctl.models.base import HysteresisModel
 from hilctl.models.linear_stages import FirstMode
@@ -32,14 +33,6 @@ _POINTS = 4096
 _LOWEST = 1e-6  # of the sample rate, and of the lowest measured frequency
 _ROUNDING = 1e-6
 _WHOLE = 0.44  # of the sample rate: a response up to there may end before a resonance
-
-
-class Exchange(NamedTuple):
-    """Timing of a loop: samples per second, samples per exchange, and exchanges to an answer."""
-
-    rate_hz: float
-    block: int = 1
-    latency_blocks: int = 0
 
 
 @dataclass(frozen=True, slots=True)

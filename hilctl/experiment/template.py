@@ -18,7 +18,6 @@ from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, commented, dump
-from hilctl.experiment.closed_loop import rounded_down
 from hilctl.experiment.devices import (
     describe,
     is_path,
@@ -26,6 +25,7 @@ from hilctl.experiment.devices import (
     made_device,
     shipped_profiles,
 )
+from hilctl.experiment.feedback import rounded_down
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 

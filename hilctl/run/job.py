@@ -21,24 +21,11 @@ from hilctl.base.files import TextFiles
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
 from hilctl.experiment.devices import made_device
+from hilctl.experiment.timing import SilenceLimits
 
 if TYPE_CHECKING:
     from hilctl.experiment.preflight import CheckedExperiment
     from hilctl.run.run_folder import RunFolder
-
-_SIMULATED_MARGIN_S = 0.5
-_HANG_S = 0.08
-_STOPPED_S = 0.02
-
-
-@dataclass(frozen=True, slots=True)
-class SilenceLimits:
-    """Longest silence of the loop before it counts as hung."""
-
-    real_time_s: float  # with real-time priority
-    ordinary_s: float  # without real-time priority, on a busy computer
-    exchange_s: float  # added while it waits for the device
-    stopped_s: float  # while its process is stopped, such as by SIGSTOP
 
 
 @dataclass(frozen=True, slots=True)
@@ -106,7 +93,7 @@ class Job:
             adapted=None if checked.operator is None else checked.operator.to_lists(),
             safe_value=limits.safe,
             ramp_per_s=limits.ramp_per_s,
-            limits=silence_limits(checked),
+            limits=checked.silence,
             supervisor=supervisor,
             silence_s=silence_s,
             safe_priority=safe_priority(checked),
@@ -144,28 +131,6 @@ class Job:
         reference = _mapped(self.reference)
         same = self.input_um == self.reference
         return reference, reference if same else _mapped(self.input_um)
-
-
-def silence_limits(checked: "CheckedExperiment") -> SilenceLimits:
-    """Return the longest silence of the loop of an experiment."""
-    config = checked.loaded.config
-    timing = config.timing
-    simulated = checked.loaded.device.info.simulated
-    hang_s = ordinary_s = timing.hang_s
-    if hang_s is None or ordinary_s is None:
-        # Without real-time priority the loop may be as late as its own limit allows.
-        ordinary_s = timing.max_late_s + (_SIMULATED_MARGIN_S if simulated else 0.0)
-        hang_s = ordinary_s if simulated else min(_HANG_S, ordinary_s)
-    periods_s = 2.0 * config.tick_s
-    return SilenceLimits(
-        real_time_s=periods_s + hang_s,
-        ordinary_s=periods_s + ordinary_s,
-        # An exchange that takes longer makes the next tick too late, which ends the run as well.
-        # Not the device's timeout, which may be long: until the answer the output stays driven.
-        exchange_s=timing.max_late_s,
-        # A stopped simulated loop may be under a debugger; no device needs protection.
-        stopped_s=periods_s + (hang_s if simulated else min(hang_s, _STOPPED_S)),
-    )
 
 
 def safe_priority(checked: "CheckedExperiment") -> int:

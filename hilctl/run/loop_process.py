@@ -19,8 +19,8 @@ from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.segments import Segment
 from hilctl.base.subprocesses import python_command
-from hilctl.experiment.conditioning import conditioning_of
 from hilctl.experiment.load import LoadedExperiment, resolve
+from hilctl.experiment.safe import starting_output
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
@@ -29,7 +29,7 @@ from hilctl.loop.safe_output import LoopOutcome, SafeGoal, describe, drive_to_sa
 from hilctl.loop.tuning import LinearBypass, Tuning
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.machine.rt_setup import SetUpStep, be_ordinary, prepare, refusals, require, step_facts
-from hilctl.run.assemble import assemble, starting_output
+from hilctl.run.assemble import assemble
 from hilctl.run.job import Job
 from hilctl.run.run_folder import GUARDIAN, keep_removed
 from hilctl.run.shared.ring import SampleRing
@@ -141,7 +141,7 @@ def plan_of(job: Job, loaded: LoadedExperiment) -> LoopPlan:
         reference,
         input_um,
         None if job.state is None else np.array(job.state),
-        conditioning_of(loaded, job.stands_um),
+        loaded.conditioning(job.stands_um),
         operator=None if job.adapted is None else DisplacementOperator.from_lists(job.adapted),
         heat_a2=job.heat_a2,
         segments=[Segment(**each) for each in job.segments],

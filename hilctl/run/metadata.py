@@ -22,7 +22,6 @@ from hilctl.base.samples import COLUMNS, NO_WAVEFORM, Flag, Samples
 from hilctl.base.segments import Segment
 from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import dump
-from hilctl.experiment.device_rules import interlock_context
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.diagnosis import machine_facts
@@ -230,7 +229,7 @@ class RunDescription(StrictModel):
                     low=each.low if math.isfinite(each.low) else None,
                     high=each.high if math.isfinite(each.high) else None,
                 )
-                for each in interlock_context(config, info).aux
+                for each in loaded.rig.aux
             ],
             settings=setting_rows(loaded.document.data),
         )
@@ -253,7 +252,7 @@ class RunDescription(StrictModel):
 
 
 def _limits(checked: "CheckedExperiment") -> LimitBounds:
-    config = checked.loaded.config
+    config, interlocks = checked.loaded.config, checked.loaded.rig.interlocks
     limits = config.limits
     return LimitBounds(
         command=list(limits.command_range),
@@ -262,7 +261,7 @@ def _limits(checked: "CheckedExperiment") -> LimitBounds:
         rms_current_a=limits.rms_current_a,
         thermal_time_constant_s=limits.thermal_time_constant_s,
         heat_a2=checked.heat_a2,
-        tracking_error_um=config.interlocks.tracking_error_um,
+        tracking_error_um=interlocks.tracking_error_um,
         measured_deviation=limits.measured_deviation,
         late_s=config.timing.max_late_s,
     )

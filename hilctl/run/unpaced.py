@@ -17,13 +17,14 @@ from hilctl.base.errors import DeviceError, HilctlError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, Samples
 from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.safe import starting_output
 from hilctl.loop.block import Block
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import AxisPlan, LoopPlan
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.loop.tuning import Tuning
-from hilctl.run.assemble import assemble, starting_output
+from hilctl.run.assemble import assemble
 from hilctl.run.metadata import end_facts
 from hilctl.run.recorder import Recorder
 from hilctl.run.result import RunResult

@@ -23,7 +23,7 @@ import numpy as np
 
 from hilctl import api
 from hilctl.base.types import F64
-from hilctl.experiment.device_state import begin, rests_at
+from hilctl.experiment.compensator import begin, rests_at
 from hilctl.experiment.load import load_experiment
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel, stroke_class

@@ -26,9 +26,9 @@ import pytest
 from hilctl.base.device import WatchdogDevice
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.load import LoadedExperiment, load_experiment
+from hilctl.experiment.safe import starting_output
 from hilctl.loop.limiter import CommandLimits, Limiter
 from hilctl.loop.pacer import SystemClock
-from hilctl.run.assemble import starting_output
 from hilctl.run.probe import probe
 
 SHARE = 0.1

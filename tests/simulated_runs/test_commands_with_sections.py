@@ -12,7 +12,8 @@ import yaml
 
 from hilctl import api
 from hilctl.base.errors import HilctlError
-from hilctl.experiment.file import Experiment, Limits
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.limits import Limits
 from tests import commands
 from tests.commands import Ended, in_process
 from tests.unit.base.test_calibration import AMPLIFIER, CALIBRATION

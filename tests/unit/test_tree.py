@@ -15,6 +15,7 @@ WITHOUT = {
     "base/events": "one record of plain values; seen in run/shared/test_shared_page.py",
     "cli/options": "types of options; cli/test_commands.py loads every command that has them",
     "drivers/contract": "the checks of tests/contract; test_bad_devices.py makes each of them fail",
+    "experiment/recording_settings": "keys: experiment/test_file.py; size: run/test_unpaced.py",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
     "recording/metadata_keys": "names; analysis/test_catalogue.py reads all of them",
     "recording/recording": "records of plain values; recording/test_reader.py fills them",

@@ -12,7 +12,7 @@ import numpy as np
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.samples import Flag
 from hilctl.base.types import F64, U32
-from hilctl.experiment.device_state import begin
+from hilctl.experiment.compensator import begin
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.lab.identify.data.records import SteadyLoop
 from hilctl.loop.interlocks import AuxLimit, InterlockContext, InterlockSettings

@@ -27,8 +27,7 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import MARK, Event
 from hilctl.base.private_dirs import private_folder
 from hilctl.base.strict import HALF_CHARACTER, StrictModel, first_problem, without_halves
-from hilctl.experiment.forecast import fade_refusal
-from hilctl.experiment.preflight import CheckedExperiment, command_problems, reference_problems
+from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.compensator import Compensator
 from hilctl.run.control.client import (
     MAX_BYTES,
@@ -206,10 +205,8 @@ class Changes:
         """Make a change when the loop has taken the previous one."""
         if wanted.gain is None and wanted.offset is None and wanted.inverse is None:
             raise InputError("set: gain, offset or inverse is required")
-        if wanted.inverse is not None:
-            checked = self._checked
-            if why := fade_refusal(checked.loaded, checked.forecast.line, wanted.inverse):
-                raise InputError(f"set: inverse: {why}")
+        if wanted.inverse is not None and (why := fade_refusal(self._checked, wanted.inverse)):
+            raise InputError(f"set: inverse: {why}")
         if not self._places.acquire(blocking=False):
             raise InputError(f"set: {_MOST_WAITING} changes are waiting already: try again")
         try:
@@ -270,11 +267,24 @@ class Changes:
         }
 
 
+def fade_refusal(checked: CheckedExperiment, wanted: str) -> str:
+    """Return why the inverse cannot be bypassed (``out``) or enabled (``in``), or an empty text."""
+    if checked.loaded.model is None:
+        return "the experiment has no compensator: there is no inverse to bypass"
+    if checked.forecast.line is None:
+        return "the reference is constant: there is no line through its ends"
+    if wanted == "out" and checked.loaded.config.limits.tracking_error_um is not None:
+        return (
+            "limits.tracking_error_um would end the run, because the displacement leaves its "
+            "reference without the inverse: remove that limit from the experiment first"
+        )
+    return ""
+
+
 def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, bypassed: bool) -> str:
     """Return why a changed reference would exceed the limits, or an empty text."""
     # The whole waveform counts; the interlock enforces the heat.
     low, high = sorted(gain * end + offset for end in checked.reference.span)
-    problems = reference_problems(checked.loaded, checked.reference.unit, low, high)
     commands = [*command_range(checked, low, high, gain)]
     if bypassed and (line := checked.forecast.line):
         commands += [line.slope * end + line.at_zero for end in (low, high)]
@@ -286,7 +296,7 @@ def bound_refusal(checked: CheckedExperiment, gain: float, offset: float, *, byp
         voltage_v=_voltage_v(checked, min(commands), max(commands)),
         budget_used_s=None,
     )
-    problems += command_problems(checked.loaded, bound)
+    problems = checked.bound_problems(low, high, bound)
     return "; ".join(f"{problem.rule}, got {problem.value}" for problem in problems)
 
 

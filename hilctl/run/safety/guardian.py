@@ -30,6 +30,7 @@ from types import FrameType
 
 from hilctl.base.device import Device
 from hilctl.base.errors import HilctlError
+from hilctl.experiment.timing import SilenceLimits
 from hilctl.loop.safe_output import (
     PATIENT_AFTER_S,
     PATIENT_PAUSE_S,
@@ -40,7 +41,7 @@ from hilctl.loop.safe_output import (
 from hilctl.machine.reserve import RESERVE
 from hilctl.machine.rt_setup import be_ordinary, be_quick
 from hilctl.machine.syscalls import LinuxProcess
-from hilctl.run.job import Job, SilenceLimits
+from hilctl.run.job import Job
 from hilctl.run.run_folder import DeviceLocks, keep_removed
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import (

@@ -13,7 +13,7 @@ from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import load_document
 from hilctl.experiment.devices import made_device
-from hilctl.experiment.file import Safe
+from hilctl.experiment.safe import Safe
 from hilctl.loop.safe_output import (
     PATIENCE_S,
     LocalError,

@@ -19,7 +19,7 @@ from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.loop.safe_output import PATIENCE_S
 from hilctl.machine.reserve import RESERVE
 from hilctl.machine.rt_setup import be_ordinary, be_quick
-from hilctl.run.job import safe_priority, silence_limits
+from hilctl.run.job import safe_priority
 from hilctl.run.processes import GuardianProcess, LoopProcess
 from hilctl.run.safety.guardian import LAST_CALL_MS, HangWatch, SafeAction, is_stopped, safe_goal
 from hilctl.run.shared.ring import SampleRing
@@ -60,7 +60,7 @@ class SafetyMonitor:
         way = max(limits.high - limits.safe, limits.safe - limits.low)
         self._patience_ns = round(1e9 * (PATIENCE_S + way / limits.ramp_per_s))
         self._priority = safe_priority(checked)
-        self._watch = HangWatch(ring.page, silence_limits(checked), lambda: is_stopped(child.pid))
+        self._watch = HangWatch(ring.page, checked.silence, lambda: is_stopped(child.pid))
         RESERVE.hold()
         self._start_guardian, self._record_event = start_guardian, record_event
         self._guardian = start_guardian(child.pid) if start_guardian else None

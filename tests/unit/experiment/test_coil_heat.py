@@ -8,6 +8,7 @@ import pytest
 from hilctl.base.samples import Flag, Samples
 from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, cooled
 from hilctl.experiment.load import load_experiment
+from tests.fakes import DESCRIBED
 from tests.unit.lab.studies.characterise.conftest import experiment
 
 __all__ = ["experiment"]
@@ -23,7 +24,7 @@ def config(experiment):
 
 @pytest.fixture
 def coil(config):
-    return CoolingCoil(config, 0.0, 100.0)
+    return CoolingCoil(config.rig(DESCRIBED), 0.0, 100.0)
 
 
 def effect(config, parts, heat_a2=0.0):
@@ -60,7 +61,7 @@ def samples(index, command, measured=None, flags=None):
 def test_without_a_budget_nothing_is_waited_for(experiment):
     config = load_experiment(experiment).config
     run = effect(config, [np.full(25000, 4.0)])
-    cold = CoolingCoil(config, 0.0, 0.0)
+    cold = CoolingCoil(config.rig(DESCRIBED), 0.0, 0.0)
     cold.ran(run, 5.0)
     assert cold.pause_s(run, 5.0) == 0.0
 

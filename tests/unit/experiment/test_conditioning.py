@@ -12,7 +12,6 @@ from hypothesis import strategies as st
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.conditioning import conditioning_of
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 from hilctl.models.model_file import load_model
@@ -45,7 +44,7 @@ def loaded(*given, text=EXPERIMENT):
 
 
 def command_of(*given, text=EXPERIMENT):
-    made = conditioning_of(loaded(*given, text=text))
+    made = loaded(*given, text=text).conditioning()
     assert made is not None
     return made.command[: made.cycle_samples], made
 
@@ -99,7 +98,7 @@ class TestCycle:
     def test_a_fifo_answers_before_the_waveform(self):
         made = loaded()
         info = replace(made.device.info, latency_blocks=3)
-        late = conditioning_of(replace(made, device=SimpleNamespace(info=info)))
+        late = replace(made, device=SimpleNamespace(info=info)).conditioning()
         assert late is not None
         assert late.command.size == 21_000 + 150
         assert late.rest == (20_500, 21_000)
@@ -142,7 +141,7 @@ class TestCheck:
         measured = check(loaded("condition=null", "compensator.offset=measured"))
         assert measured.conditioning().stands_um is not None
         assert (measured.conditioning().command == 0.0).all()
-        assert conditioning_of(loaded(text=PIEZO)).stands_um is None
+        assert loaded(text=PIEZO).conditioning().stands_um is None
 
     def test_zero_of_the_sensor_is_measured_with_and_without_a_model(self):
         rest = check(loaded("condition=null", "zero=true")).conditioning()

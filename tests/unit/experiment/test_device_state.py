@@ -12,13 +12,12 @@ from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader, Flag
 from hilctl.base.yaml import Document
 from hilctl.experiment.coil_heat import CoilHeat
+from hilctl.experiment.compensator import InitialState, left_by
 from hilctl.experiment.device_state import (
-    InitialState,
     finish_state,
     heat_after,
     heat_before,
     initial_state_after,
-    left_by,
     left_by_last_run,
 )
 from hilctl.experiment.load import resolve

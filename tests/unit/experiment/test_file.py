@@ -6,13 +6,14 @@ from types import SimpleNamespace
 from typing import ClassVar
 
 import pytest
-from pydantic import ConfigDict, TypeAdapter, ValidationError
+from pydantic import TypeAdapter, ValidationError
 
 from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml import Document
 from hilctl.experiment import devices as registry
-from hilctl.experiment import file as sections
+from hilctl.experiment.file import Name
+from hilctl.experiment.limits import Interval
 from hilctl.experiment.load import load_experiment, resolve
 
 FULL = """\
@@ -316,7 +317,7 @@ class TestModel:
         assert problems(FULL, folder) == [(f"{path}:{line}", key)]
 
 
-NAME, INTERVAL = TypeAdapter(sections.Name), TypeAdapter(sections.Interval)
+NAME, INTERVAL = TypeAdapter(Name), TypeAdapter(Interval)
 
 
 @pytest.mark.parametrize("text", ["a", "9.x_y-z", "a" * 80])
@@ -328,66 +329,3 @@ def test_names_that_can_be_file_names(text):
 def test_other_names_are_refused(text):
     with pytest.raises(ValidationError, match="at most 80 letters"):
         NAME.validate_python(text)
-
-
-@pytest.mark.parametrize("ways", [{}, {"kp": 0.1}, {"bandwidth_hz": 5.0, "ki_per_s": 3.0},
-                                  {"bandwidth_hz": 5.0, "kp": 0.1}])  # fmt: skip
-def test_no_way_of_feedback_and_both_are_refused(ways):
-    with pytest.raises(ValidationError, match="either bandwidth_hz"):
-        sections.PiFeedbackConfig(limit_um=1.0, **ways)
-
-
-STROKE = {"stroke_um": (-50.0, 50.0)}
-CURRENT = {"peak_current_a": 7.0, "slew_a_per_s": 1e4}
-IN_VOLTS = {"drive_v": (-20.0, 120.0), "slew_v_per_s": 2e4}
-
-
-@pytest.mark.parametrize("given", [{}, {"peak_current_a": 7.0}, {"slew_v_per_s": 2e4},
-                                   {**CURRENT, "drive_v": (0.0, 1.0)},
-                                   {**CURRENT, "drive_a": (0.0, 1.0)},
-                                   {**CURRENT, **IN_VOLTS}])  # fmt: skip
-def test_incomplete_and_mixed_limits_are_refused(given):
-    with pytest.raises(ValidationError, match="peak_current_a"):
-        sections.Limits(**STROKE, **given)
-
-
-DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
-LABELS = TypeAdapter(sections.Labels, config=ConfigDict(strict=True))
-
-
-@pytest.mark.parametrize("labels", [
-    {"a": True}, {"a": None}, {"a": "x" * (sections.LONGEST_TEXT + 1)},
-    {"a b": 1}, {"9a": 1}, {"a" * 41: 1},
-    {f"a{n}": n for n in range(sections.MOST_LABELS + 1)},
-])  # fmt: skip
-def test_what_is_no_label_is_refused(labels):
-    with pytest.raises(ValidationError):
-        LABELS.validate_python(labels)
-
-
-@pytest.mark.parametrize(("text", "value"), [
-    ("sample=A7", "A7"),
-    ("serial=0012", "0012"),  # a number would lose its zeros
-    ("t=-21.5", -21.5),
-    ("n=3", 3),
-    ("x=1e3", 1000.0),
-    ("note=a: [b], \"c\" = 'd' #e", "a: [b], \"c\" = 'd' #e"),
-    ("empty=", ""),
-    ("lines=a\nb\u202e\x1b", "a\nb\u202e\x1b"),
-    ("flag=true", "true"),
-])  # fmt: skip
-def test_a_label_of_the_command_line_stands_as_it_was_typed(text, value):
-    labels = load_experiment(DEMO, sections.label_settings([text])).config.labels
-    assert labels == {text.partition("=")[0]: value}
-    assert type(*labels.values()) is type(value)
-
-
-def test_labels_of_the_command_line_join_those_of_the_file():
-    settings = ["labels={sample: A1, operator: Ann}", *sections.label_settings(["sample=A7"])]
-    assert load_experiment(DEMO, settings).config.labels == {"sample": "A7", "operator": "Ann"}
-
-
-def test_all_that_are_none_are_listed():
-    with pytest.raises(ConfigError) as refused:
-        sections.label_settings(["sample", "a=1", "a.b=2"])
-    assert [each.where for each in refused.value.problems] == ["--label sample", "--label a.b=2"]

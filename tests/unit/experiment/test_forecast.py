@@ -10,9 +10,8 @@ import numpy as np
 import pytest
 
 from hilctl.experiment import forecast as command_simulation
-from hilctl.experiment.forecast import LineEnds, fade_refusal, simulate_commands
+from hilctl.experiment.forecast import LineEnds, simulate_commands
 from hilctl.loop.compensator import Compensator
-from hilctl.loop.tuning import LinearBypass
 from hilctl.models.model_file import load_model
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.waveforms import shapes
@@ -179,17 +178,3 @@ def test_what_stands_still_or_is_no_number_has_no_line():
         ends = LineEnds()
         ends.add(reference, command)
         assert ends.line() is None
-
-
-def test_what_can_not_go_out_is_said():
-
-    def refused(line=LinearBypass(), wanted="out", model=1, tracking_error_um=None):  # noqa: B008
-        limits = SimpleNamespace(tracking_error_um=tracking_error_um)
-        loaded = SimpleNamespace(model=model, config=SimpleNamespace(limits=limits))
-        return fade_refusal(loaded, line, wanted)
-
-    assert refused() == ""
-    assert "no compensator" in refused(model=None)
-    assert "constant" in refused(line=None)
-    assert "limits.tracking_error_um" in refused(tracking_error_um=5.0)
-    assert refused(wanted="in", tracking_error_um=5.0) == ""

@@ -48,7 +48,7 @@ def test_expected_error_is_that_of_the_stroke_within_the_range(amplitude, freque
 
 def test_somewhat_faster_is_warned_and_much_faster_refused():
     assert "up to about 15" in findings(sine(150.0, 20.0)).warnings[0]
-    assert "at about 250 Hz" in findings(sine(250.0)).refused[0]
+    assert "at about 250 Hz" in findings(sine(250.0)).refused[0].rule
 
 
 def test_a_corner_is_warned_not_refused():

@@ -6,16 +6,16 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.experiment.closed_loop import gains_for
+from hilctl.experiment.feedback import gains_for
 from hilctl.experiment.open_loop import (
     ASSUMED_PHASE_MARGIN_DEG,
     LEAST_GAIN_MARGIN_DB,
-    Exchange,
     MeasuredResponse,
     assumed_response,
     load_response,
     write_response,
 )
+from hilctl.experiment.rig import Exchange
 from hilctl.loop.feedback import Feedback, Gains, IntegralFeedback
 from hilctl.models.linear_stages import FirstMode
 from tests.unit.loop.test_feedback import blocks, plant

@@ -9,16 +9,14 @@ import numpy as np
 import pytest
 from pydantic import ConfigDict
 
-from hilctl.base.errors import ConfigError, DataError
+from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
 from hilctl.experiment import preflight as module
-from hilctl.experiment.coil_heat import RunHeat
+from hilctl.experiment.compensator import CompensatorConfig
 from hilctl.experiment.correction import Correction, LearnedCycle, signature
-from hilctl.experiment.device_state import InitialState, left_by
-from hilctl.experiment.file import CompensatorConfig
 from hilctl.experiment.load import load_experiment, resolve
 from hilctl.experiment.model_validity import UNKNOWN
-from hilctl.experiment.preflight import check, command_problems
+from hilctl.experiment.preflight import check
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.model_file import model_sha256
 from hilctl.models.plays import RdpiModel
@@ -122,15 +120,6 @@ def compensated(made, **keys):
     return replace(made, config=config)
 
 
-@pytest.mark.parametrize("at_start", [-8.0, 8.0])
-def test_a_start_within_the_device_s_range_is_taken(at_start):
-    assert checked(CURRENT, f"safe.at_start={at_start}").loaded.config.safe.at_start == at_start
-
-
-def test_a_start_that_the_device_can_not_hold_is_refused():
-    assert told(refusals(CURRENT, "safe.at_start=8.5")) == [("safe.at_start", "8.5")]
-
-
 class TestReference:
     @pytest.mark.parametrize(("stroke", "known", "rule", "hint"), [
         ("[-9.5, 60.0]", None, "-9.5 to 60 µm", "0.5 µm"),
@@ -177,79 +166,7 @@ class TestCommand:
         assert [problem.key for problem in found] == ["compensator.model"]
 
 
-VOLTS = (
-    CURRENT.replace("unit: A", "unit: V")
-    .replace("peak_current_a: 7.0", "drive_v: [0.0, 6.0]")
-    .replace("slew_a_per_s", "slew_v_per_s")
-)
-HEAT = ["limits.rms_current_a=3.5", "limits.thermal_time_constant_s=0.6"]
 VOLTAGE = "amplifier={voltage_max_v: 8.0, resistance_ohm: 1.0, inductance_h: 0.02}"
-ADVISED = re.compile(r"(?:set|raise) (\S+) to (\[.*?\]|[-\d.e+]+)")
-
-
-@pytest.mark.parametrize(
-    ("text", "settings", "given", "advised", "others"),
-    [
-        (CURRENT, ["limits.peak_current_a=6.1234567"], {}, "raise limits.peak_current_a to 6.5",
-         [["waveform.amplitude=5.6"], ["waveform.offset=0.1"]]),
-        (CURRENT, ["limits.peak_current_a=6.0", "waveform.amplitude=7.9"],
-         {}, "fake, -8 to 8 A", [["waveform.amplitude=5.5"]]),
-        (CURRENT, ["waveform.offset=9.0", "limits.slew_a_per_s=1e6"], {}, "fake, -8 to 8 A",
-         [["waveform.offset=1.0"]]),
-        (CURRENT, ["waveform.offset=9.0", "waveform.amplitude=8.0", "limits.slew_a_per_s=1e6"],
-         {}, "fake, -8 to 8 A", [["waveform.offset=1.0", "waveform.amplitude=6.0"]]),
-        (CURRENT, ["limits.peak_current_a=9.0"], {}, "set limits.peak_current_a to 8.0", []),
-        (CURRENT, ["waveform.offset=3.5", "waveform.amplitude=3.0", "limits.slew_a_per_s=1e6"],
-         {"command_min": 0.0, "command_max": 20.0}, "limits.drive_a to [0.0, 7.0]", []),
-        (VOLTS, [], {"command_unit": "V"}, "raise limits.drive_v to [-5.5, 6.5]",
-         [["waveform.offset=0.0", "limits.drive_v=[-6.0, 6.0]"]]),
-        (CURRENT, ["limits.slew_a_per_s=123.4567"], {}, "raise limits.slew_a_per_s to 5000",
-         [["waveform.soft_start_s=0.5", "waveform.frequency_hz=2.0"]]),
-        (CURRENT, HEAT, {}, "end it within 0.63",
-         [["waveform.duration_s=0.6333"], ["waveform.amplitude=4.0"]]),
-        (CURRENT, [*HEAT, "waveform.amplitude=1.0", "condition={decay: 1.0, cycles: 50}"], {},
-         "condition's amplitude", [["condition.amplitude_a=3.0"], ["condition.cycles=3"]]),
-        (CURRENT, [*HEAT, "limits.slew_a_per_s=1e6", "safe.value=3.6"], {}, "lower safe.value",
-         [["safe.value=0.0", "waveform.amplitude=4.0"]]),
-        (DISPLACEMENT, ["limits.stroke_um=[-5.0, 60.0]"], {}, "amplitude or offset",
-         [["waveform.amplitude=4.5"], ["waveform.offset=6.0"]]),
-        (DISPLACEMENT, ["limits.stroke_um=[-9.0, 9.0]"], {}, "lower the waveform's amplitude",
-         [["waveform.amplitude=8.5"]]),
-        (DISPLACEMENT, ["limits.slew_a_per_s=1000.0", "waveform.soft_start_s=0"],
-         {"offset_um": 20.0}, "set waveform.soft_start_s to", []),
-        (CURRENT, [VOLTAGE, "waveform.soft_start_s=0.3"], {}, "set waveform.amplitude to",
-         [["waveform.frequency_hz=5.0"], ["amplifier.voltage_max_v=10.2"]]),
-        (CURRENT, [VOLTAGE], {}, "soft_start_s",
-         [["waveform.soft_start_s=0.3", "waveform.amplitude=4.0"]]),
-        (CURRENT, [VOLTAGE, "amplifier.resistance_ohm=4.0", "waveform.soft_start_s=0.3"], {},
-         "2 A", [["waveform.amplitude=0.5"]]),
-        (CURRENT, [VOLTAGE, "waveform.amplitude=1.0", "waveform.soft_start_s=0.3",
-                   "condition={amplitude_a: 6.0}"], {},
-         "condition's", [["condition.frequency_hz=3.0"], ["condition.amplitude_a=3.0"]]),
-    ],
-)  # fmt: skip
-def test_what_a_message_advises_passes_the_check(text, settings, given, advised, others):
-    offset_um = given.pop("offset_um", 0.0)
-    model = terfenol_rdpi().model_copy(update={"output_offset_um": offset_um})
-    given = given | ({"model": model} if text is DISPLACEMENT else {})
-    (found,) = refusals(text, *settings, **given)
-    assert advised in found.hint
-    cures = [[f"{key}={value}"] for key, value in ADVISED.findall(found.hint)] + others
-    for cure in cures:
-        instead = ["limits.peak_current_a=null"] if "limits.drive_a" in cure[0] else []
-        checked(text, *settings, *cure, *instead, **given)
-
-
-def test_a_file_that_is_too_large_is_cured_by_its_scale(tmp_path):
-    path = tmp_path / "reference.csv"
-    path.write_text(
-        "reference\n" + "\n".join(f"{10.0 * np.sin(2e-3 * np.pi * k):.6f}" for k in range(1000))
-    )
-    waveform = f"waveform={{kind: file, path: {path}, unit: A, file_rate_hz: 10000.0}}"
-    settings, model = (waveform, "limits.stroke_um=[-9.0, 9.0]"), terfenol_rdpi()
-    (found,) = refusals(DISPLACEMENT, *settings, model=model)
-    assert "scale" in found.hint
-    checked(DISPLACEMENT, *settings, "waveform.scale=0.85", model=model)
 
 
 @pytest.mark.parametrize(("bandwidth", "gain"), [("", 1.0), (", bandwidth_hz: 10.0", 0.5**0.5)])
@@ -266,40 +183,6 @@ def test_an_amplifier_is_for_a_device_driven_in_current():
     with pytest.raises(ConfigError) as caught:
         load_experiment(CONFIGS / "piezo_sine.yaml", [VOLTAGE])
     assert [problem.key for problem in caught.value.problems] == ["amplifier"]
-
-
-class TestBudget:
-    BUDGET: ClassVar = ("limits.rms_current_a=4.0", "limits.thermal_time_constant_s=20.0")
-
-    def hint(self, begins_rms_a, hottest_a2, safe=0.0):
-        made = loaded(CURRENT, *self.BUDGET, f"safe.value={safe}")
-        forecast = replace(
-            checked(CURRENT).forecast, heating_rms_a=4.5, budget_used_s=1.5, before_s=1.5,
-            begins_rms_a=begins_rms_a, heat=RunHeat(2.0, 1.0, hottest_a2),
-        )  # fmt: skip
-        (problem,) = command_problems(made, forecast)
-        assert problem.key == "limits.rms_current_a"
-        assert problem.value == "4.5 A"
-        return problem.hint
-
-    @pytest.mark.parametrize(
-        ("begins_rms_a", "hottest_a2", "safe", "wait_s"),
-        [(3.0, 4.0, 0.0, 16), (2.02, 4.0, 0.0, 0), (3.5, 10.0, 3.0, 24)],
-    )
-    def test_heat_of_the_last_run_is_waited_for(self, begins_rms_a, hottest_a2, safe, wait_s):
-        """20 s times ln(9 / 4), ln(4.08 / 4), and ln(3.25 / 1) above what the safe value makes."""
-        hint = self.hint(begins_rms_a, hottest_a2, safe)
-        assert f"{begins_rms_a:.3g} A" in hint
-        assert hint.endswith(f"wait {wait_s} s")
-
-    @pytest.mark.parametrize(
-        ("begins_rms_a", "hottest_a2", "safe"),
-        [(1.0, 4.0, 0.0), (3.0, 4.0, 2.0), (3.5, 8.0, 3.0), (None, 0.5, 0.0)],
-    )
-    def test_no_wait_helps_a_run_that_makes_the_heat_itself(self, begins_rms_a, hottest_a2, safe):
-        hint = self.hint(begins_rms_a, hottest_a2, safe)
-        assert hint.startswith("0.5 A")
-        assert "after 1.5 s" in hint
 
 
 class TestDevice:
@@ -411,29 +294,6 @@ def test_a_reference_beyond_what_the_model_was_identified_on_is_warned_or_refuse
     assert check(loaded(DISPLACEMENT, model=terfenol_rdpi())).warnings == (UNKNOWN,)
 
 
-MOVED = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
-"""At 0 A the actuator rests at 24.5 um."""
-
-
-@pytest.mark.parametrize(
-    ("setting", "cure"),
-    [
-        ("waveform.soft_start_s=0", r"set (waveform\.soft_start_s) to ([.\d]+)"),
-        ("waveform.rest=0", r"remove (waveform\.rest): ([.\d]+)"),
-    ],
-)
-def test_a_reference_begins_where_the_actuator_rests(setting, cure):
-    """From 0 um the first command would be a step."""
-    found = checked(DISPLACEMENT, model=MOVED)
-    assert found.reference.values[0] == 24.5
-    (problem,) = refusals(DISPLACEMENT, setting, model=MOVED)
-    assert problem.key == "waveform"
-    assert "24.5 µm" in problem.rule
-    assert "slew" not in str(problem)
-    key, value = re.search(cure, problem.hint).groups()
-    assert checked(DISPLACEMENT, setting, f"{key}={value}", model=MOVED)
-
-
 PIEZO = """\
 name: piezo
 device: {kind: simulated_piezo}
@@ -495,105 +355,6 @@ def test_an_excess_below_a_step_of_the_output_is_clamped_and_said():
     assert problem.key == "limits.drive_v"
 
 
-def test_a_soft_start_begins_where_the_last_run_left_the_actuator(monkeypatch):
-    """A unipolar drive cannot bring it back to rest."""
-    left = left_by([100.0 * np.sin(np.linspace(0.0, np.pi, 1000))], STAGE, 1000.0)
-    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (left, "as left"))
-    made = compensated(loaded(PIEZO, model=STAGE, **VOLTS), initial_state="last")
-    found = check(made)
-    assert left.stands_um > 1.0
-    assert found.begun.input_um[0] == pytest.approx(left.stands_um)
-    assert found.forecast.command_min > -1e-9
-    assert found.reference.values[0] == pytest.approx(0.006)
-
-
-def test_a_start_that_would_trip_on_the_tracking_error_is_refused(monkeypatch):
-    left = left_by([100.0 * np.sin(np.linspace(0.0, np.pi, 1000))], STAGE, 1000.0)
-    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (left, "as left"))
-    given = ("waveform.soft_start_s=0.0", "limits.tracking_error_um=1.0", "limits.tracking_s=0.0")
-    far = compensated(loaded(PIEZO, *given, model=STAGE, **VOLTS), initial_state="last")
-    with pytest.raises(ConfigError) as refused:
-        check(far)
-    assert [each.key for each in refused.value.problems] == ["waveform"]
-
-
-class Offset(HysteresisModel):
-    """Commands are 3 A above the reference, and rest comes slowly: a um more with each sample."""
-
-    @property
-    def operators(self):
-        """Return 1: a number that is added to the commands."""
-        return 1
-
-    def forward(self, sample_rate_hz):
-        def run(x, memory, out):
-            out[:] = np.arange(x.size)
-
-        return Operator(run, (), self.operators)
-
-    def inverse(self, sample_rate_hz):
-        def run(x, memory, out):
-            out[:] = x + 3.0 + memory[0]
-
-        return Operator(run, (), self.operators)
-
-
-FAST = (
-    "waveform.rest=0",
-    "limits.slew_a_per_s=400.0",
-    "waveform.frequency_hz=20.0",
-    "waveform.amplitude=3.5",
-)
-
-
-@pytest.mark.parametrize(("rate_hz", "rests_um"), [(10_000.0, 999), (40.0, 3), (2.0, 0)])
-def test_where_it_rests_is_said_once_all_stages_do(rate_hz, rests_um):
-    slow = (
-        "waveform.rest=0",
-        f"sample_rate_hz={rate_hz}",
-        "limits.slew_a_per_s=1.0",
-        "waveform.frequency_hz=0.01",
-    )
-    (found,) = refusals(DISPLACEMENT, *slow, "waveform.amplitude=1.0", model=Offset())
-    assert (found.key, found.value) == ("waveform", "0 µm")
-    assert f" {rests_um} µm" in found.rule
-    assert "3 A" in found.hint
-
-
-def test_at_the_safe_value_there_is_no_step():
-    (found,) = refusals(DISPLACEMENT, *FAST, "safe.value=3.0", model=Offset())
-    assert found.key == "limits.slew_a_per_s"
-
-
-def test_the_first_command_is_that_of_the_state_it_begins_with(monkeypatch):
-    there = InitialState(np.array([-3.0, 0.0]), 0.0, "before")
-    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (there, "as left"))
-    made = compensated(loaded(DISPLACEMENT, *FAST, model=Offset()), initial_state="last")
-    assert [problem.key for problem in refused(made)] == ["limits.slew_a_per_s"]
-
-
-def test_a_run_before_that_says_nothing_is_a_problem(monkeypatch):
-    def refuse(path, *_):
-        raise DataError(f"{path}: nothing there")
-
-    monkeypatch.setattr(module, "initial_state_after", refuse)
-    made = loaded(DISPLACEMENT, model=terfenol_rdpi())
-    (problem,) = refused(compensated(made, initial_state="before.mcap"))
-    assert problem.key == "compensator.initial_state"
-    assert problem.rule == "before.mcap: nothing there"
-
-
-def test_a_faster_change_further_on_is_what_is_told():
-    moved = terfenol_rdpi().model_copy(update={"output_offset_um": 24.5})
-    holds = ", ".join(f"{{kind: hold, level: {um}, duration_s: 0.2}}" for um in (22.0, 18.0))
-    steps = f"waveform={{kind: sequence, unit: A, parts: [{holds}]}}"
-    (found,) = refusals(DISPLACEMENT, steps, "limits.slew_a_per_s=1000.0", model=moved)
-    assert found.key == "limits.slew_a_per_s"
-    a_third_more = steps.replace("22.0", "0.0").replace("18.0", "3.9")
-    (found,) = refusals(DISPLACEMENT, a_third_more, model=Offset())
-    assert found.key == "limits.slew_a_per_s"
-
-
 def learned(made, waveform):
     """Return a correction for one segment of an experiment that was checked without."""
     wanted = signature(made.reference.values, waveform)
@@ -642,32 +403,3 @@ def test_work_that_takes_long_is_told(monkeypatch, caplog):
     checked(DISPLACEMENT, longer, model=terfenol_rdpi())
     (record,) = caplog.records
     assert f"{samples * 1e-6:.3g} million samples" in record.getMessage()
-
-
-def test_a_rest_before_the_waveform_does_not_make_the_last_run_forgotten(monkeypatch):
-    model = terfenol_rdpi()
-    there = InitialState(model.inverse(10_000.0).state(), 0.0, "before")
-    monkeypatch.setattr(module, "left_by_last_run", lambda *_: (there, "as left"))
-    made = loaded(DISPLACEMENT, model=model)
-    for named, run_id in (("last", "before"), ("rest", "")):
-        found = check(compensated(made, initial_state=named, offset="measured"))
-        assert found.conditioning() is not None
-        assert found.begun.run_id == run_id
-
-
-SHORT = "{kind: sine, amplitude: 1.0, frequency_hz: 1000.0, duration_s: 0.0011}"
-
-
-@pytest.mark.parametrize(
-    ("waveform", "cure"),
-    [
-        ("{kind: hold, unit: A, level: 0.0, duration_s: 1.0}", "trigger.output=segment"),
-        (f"{{kind: sequence, unit: A, parts: [{SHORT}, {SHORT}]}}", "sample_rate_hz=20000"),
-    ],
-    ids=["no cycles", "marks of two parts in a row"],
-)
-def test_cycles_that_cannot_be_marked_are_refused(waveform, cure):
-    bad = (f"waveform={waveform}", "trigger={output: cycle}", "limits.slew_a_per_s=1e6")
-    (problem,) = refusals(CURRENT, *bad, digital_output="DO")
-    assert (problem.key, problem.value) == ("trigger.output", "cycle")
-    checked(CURRENT, *bad, cure, digital_output="DO")

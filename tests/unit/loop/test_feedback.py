@@ -9,9 +9,8 @@ from hypothesis import strategies as st
 
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
-from hilctl.base.yaml import Document
-from hilctl.experiment.closed_loop import gains_for, make_feedback
-from hilctl.experiment.file import Experiment, PiFeedbackConfig
+from hilctl.experiment.feedback import PiFeedbackConfig, gains_for, make_feedback
+from hilctl.experiment.rig import Exchange
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains, IntegralFeedback
 from hilctl.loop.limiter import CommandLimits
@@ -209,10 +208,8 @@ class TestAroundModels:
     def errors(self, model, offset_um, limit_um=20.0):
         """Run reference, feedback, compensator and actuator sample by sample; errors in um."""
         compensator = Compensator(model, RATE_HZ)
-        config = Document("experiment", EXPERIMENT).validate(Experiment)
-        settings = {"limit_um": limit_um, "bandwidth_hz": 20.0}
-        config = config.model_copy(update={"feedback": PiFeedbackConfig(**settings)})
-        feedback = make_feedback(config, compensator)
+        wanted = PiFeedbackConfig(limit_um=limit_um, bandwidth_hz=20.0)
+        feedback = make_feedback(wanted, Exchange(RATE_HZ), compensator.preview)
         actuator = model.forward(RATE_HZ)
         reference = 8.0 * np.sin(2.0 * np.pi * 5.0 * np.arange(5000) / RATE_HZ) ** 3
         ahead, wanted, errors = compensator.ahead(reference), np.zeros(1), np.zeros(5000)

@@ -4,7 +4,6 @@ import math
 import shutil
 from dataclasses import replace
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import numpy as np
@@ -14,7 +13,7 @@ from hilctl.base.errors import RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import load_experiment, resolve
-from hilctl.run.job import Job, silence_limits
+from hilctl.run.job import Job
 from hilctl.run.loop_process import loaded_of
 from hilctl.run.run_folder import run_folder
 from hilctl.run.start import checked_experiment
@@ -79,18 +78,3 @@ def test_samples_that_find_no_room_are_told(folder, monkeypatch):
     monkeypatch.setattr(np, "save", Mock(side_effect=OSError("8000 requested and 512 written")))
     with pytest.raises(RunError, match=r"8000 requested.*recording\.ring_s"):
         Job.of(plain, folder, locks=[], take_over=False, supervisor=1, silence_s=1.0)
-
-
-@pytest.mark.parametrize(("given", "simulated", "real_time_s", "ordinary_s", "stopped_s"), [
-    (None, False, 0.1, 1.02, 0.04),
-    (0.5, False, 0.52, 0.52, 0.04),
-    (None, True, 1.52, 1.52, 1.52),
-])  # fmt: skip
-def test_how_long_a_loop_may_be_silent(given, simulated, real_time_s, ordinary_s, stopped_s):
-    config = SimpleNamespace(timing=SimpleNamespace(hang_s=given, max_late_s=1.0), tick_s=0.01)
-    device = SimpleNamespace(info=SimpleNamespace(simulated=simulated))
-    loaded = SimpleNamespace(config=config, device=device)
-    limits = silence_limits(SimpleNamespace(loaded=loaded))
-    assert (limits.real_time_s, limits.exchange_s) == (pytest.approx(real_time_s), 1.0)
-    assert limits.ordinary_s == pytest.approx(ordinary_s)
-    assert limits.stopped_s == pytest.approx(stopped_s)

@@ -251,7 +251,7 @@ class _Steps:
         now = self._host.now()
         heat_a2, now_s = _heat_a2(each, self._last, now), now.boot_s
         # The coil's own model from here on.
-        coil = CoolingCoil(each.loaded.config, heat_a2, now_s)
+        coil = CoolingCoil(each.loaded.rig, heat_a2, now_s)
         to_rms_a = self._plan.campaign.config.cool_down.to_rms_a or float("inf")
         pause_s = coil.pause_s(each.heat, now_s, to_rms_a)
         self._runner.cool(f"step {each.step.number}", pause_s)

@@ -127,7 +127,7 @@ def _cooling(
         if heat_a2 is not None and each.kept is not None:
             found.append(each)
             continue
-        coil = CoolingCoil(each.loaded.config, heat_now_a2, now_s)
+        coil = CoolingCoil(each.loaded.rig, heat_now_a2, now_s)
         pause_s = coil.pause_s(each.heat, now_s, to_rms_a)
         found.append(replace(each, pause_s=pause_s, heat_a2=coil.heat_a2(now_s + pause_s)))
         now_s += pause_s + each.seconds

@@ -18,8 +18,9 @@ from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import Document, Loc, dotted, load_document
+from hilctl.experiment.conditioning import Condition
 from hilctl.experiment.devices import device_class, known_devices
-from hilctl.experiment.file import Condition, Name
+from hilctl.experiment.file import Name
 from hilctl.experiment.load import LoadedExperiment, document_with, named_from, resolve
 from hilctl.lab.studies.step_runner import setting
 

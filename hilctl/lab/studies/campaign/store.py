@@ -18,8 +18,8 @@ from hilctl.analysis.export import write_parquet
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import exists, reason, write_file, write_text
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
-from hilctl.experiment.file import RecordingConfig
 from hilctl.experiment.load import document_with
+from hilctl.experiment.recording_settings import RecordingConfig
 from hilctl.lab.studies.campaign.plan import CampaignPlan
 from hilctl.lab.studies.campaign.steps import CampaignStep, CampaignSteps, cell, settings_of
 from hilctl.lab.studies.multi_run.collect import (

@@ -121,7 +121,7 @@ class CharacterisationRunner:
         # Reject everything that does not depend on the waveform before anything moves.
         rest = setting("waveform", at_rest(self.limits))
         checked_experiment(experiment, [*self._settings, rest])
-        self._coil = CoolingCoil(self._loaded.config, 0.0, 0.0)
+        self._coil = CoolingCoil(self._loaded.rig, 0.0, 0.0)
         self._measured = Measured()
         self._rows: list[StepRow] = []
         self._recordings: dict[str, Path] = {}
@@ -129,7 +129,7 @@ class CharacterisationRunner:
     @cached_property
     def plan(self) -> CharacterisationPlan:
         """Plan of all steps at full amplitude."""
-        coil, now_s, pauses_s = CoolingCoil(self._loaded.config, 0.0, 0.0), 0.0, 0.0
+        coil, now_s, pauses_s = CoolingCoil(self._loaded.rig, 0.0, 0.0), 0.0, 0.0
         rows = []
         for step in STEPS:
             keys = step.waveform(self.limits, Measured())
@@ -283,7 +283,7 @@ class CharacterisationRunner:
     def _pause_s(self, heat: RunHeat) -> float:
         """Return the time to cool after the steps so far and the device's last run."""
         now = self._host.now()
-        last = CoolingCoil(self._loaded.config, heat_before(self._loaded, now)[0], now.boot_s)
+        last = CoolingCoil(self._loaded.rig, heat_before(self._loaded, now)[0], now.boot_s)
         return max(coil.pause_s(heat, now.boot_s) for coil in (self._coil, last))
 
     def _with_model(self, output: Path, *, overwrite: bool) -> Characterisation:

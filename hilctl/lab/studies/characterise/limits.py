@@ -74,7 +74,7 @@ class CharacterisationLimits:
     def scale(self, values: F64) -> float:
         """Return the factor, <= 1, that keeps commands within slew, voltage and heat."""
         config = self.loaded.config
-        figures = CommandFigures(config, self.rest, self.rest**2)
+        figures = CommandFigures(self.loaded.rig, self.rest, self.rest**2)
         figures.add(values)
         scale = 1.0
         if figures.slew_per_s > 0.0:

@@ -22,6 +22,7 @@ from hilctl.base.events import MARK
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
+from hilctl.loop.tuning import LinearBypass
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.run.control import client
 from hilctl.run.control.client import MAX_BYTES, VERSION, ask
@@ -33,6 +34,7 @@ from hilctl.run.control.requests import (
     SetRequest,
     bound_refusal,
     command_range,
+    fade_refusal,
 )
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared.shared_page import SIZE, PageField, Phase, SharedPage, Stop
@@ -603,3 +605,18 @@ def test_a_path_that_cannot_be_used_is_an_error(tmp_path):
     with pytest.raises(RunError, match="can't listen"):
         ControlServer(tmp_path / ("x" * 200), echo)
     assert list(tmp_path.iterdir()) == []
+
+
+def test_what_can_not_go_out_is_said():
+
+    def refused(line=LinearBypass(), wanted="out", model=1, tracking_error_um=None):  # noqa: B008
+        limits = SimpleNamespace(tracking_error_um=tracking_error_um)
+        loaded = SimpleNamespace(model=model, config=SimpleNamespace(limits=limits))
+        checked = SimpleNamespace(loaded=loaded, forecast=SimpleNamespace(line=line))
+        return fade_refusal(checked, wanted)
+
+    assert refused() == ""
+    assert "no compensator" in refused(model=None)
+    assert "constant" in refused(line=None)
+    assert "limits.tracking_error_um" in refused(tracking_error_um=5.0)
+    assert refused(wanted="in", tracking_error_um=5.0) == ""

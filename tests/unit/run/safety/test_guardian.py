@@ -16,9 +16,10 @@ from unittest.mock import Mock
 import pytest
 
 from hilctl.base.errors import DeviceError
+from hilctl.experiment.timing import SilenceLimits
 from hilctl.loop.safe_output import LoopOutcome, SafeGoal
 from hilctl.run import run_folder
-from hilctl.run.job import Job, SilenceLimits
+from hilctl.run.job import Job
 from hilctl.run.run_folder import DeviceLocks
 from hilctl.run.safety import guardian
 from hilctl.run.safety.guardian import (

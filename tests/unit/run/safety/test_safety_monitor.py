@@ -6,6 +6,7 @@ from unittest.mock import Mock
 import pytest
 
 from hilctl.base.errors import DeviceError, RunError
+from hilctl.experiment.timing import Timing, silence_limits
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run.safety import guardian as actions
@@ -51,14 +52,13 @@ class Run:
             make_safe=self.make_safe,
             close=lambda: self.log.append("closed"),
         )
-        timing = SimpleNamespace(hang_s=None, max_late_s=1.0)
         config = SimpleNamespace(
-            timing=timing,
-            tick_s=0.01,
             command_limits=lambda: CommandLimits(-5.0, 5.0, 50.0, 0.25, 50.0),
             realtime=SimpleNamespace(priority=80),
         )
-        self.checked = SimpleNamespace(loaded=SimpleNamespace(config=config, device=device))
+        silence = silence_limits(Timing(), 0.01, simulated=simulated)
+        loaded = SimpleNamespace(config=config, device=device)
+        self.checked = SimpleNamespace(loaded=loaded, silence=silence)
         child = SimpleNamespace(pid=1, kill=self.kill_loop)
         monkeypatch.setattr(module, "is_stopped", lambda pid: False)
         self.priorities = []

@@ -1,0 +1,292 @@
+"""The ``limits`` section: settings, and the rules on device, reference and commands."""
+
+import math
+from collections.abc import Iterator
+from typing import Annotated, Any, Self
+
+from hilctl.base.device import DeviceInfo
+from hilctl.base.errors import ConfigProblem, broken
+from hilctl.base.strict import BeforeValidator, Field, model_validator
+from hilctl.base.types import CommandUnit
+from hilctl.experiment.coil_heat import CoolingCoil
+from hilctl.experiment.cures import SLOWER, Course, cure, fitting, rounded_up, smaller
+from hilctl.experiment.forecast import Forecast
+from hilctl.experiment.rig import RunRig
+from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
+from hilctl.waveforms.spec import AnyWaveform
+
+_ROUNDING = 1e-9  # of the range of commands
+_TRACKING_SHARE = 0.25  # of limits.stroke_um
+_TRACKING_S = 1e-3  # less than half a period at 250 Hz, and two samples on a slow wire
+
+
+def _interval(value: Any) -> Any:
+    numbers = isinstance(value, tuple) and all(isinstance(each, int | float) for each in value)
+    if isinstance(value, tuple) and (len(value) != 2 or (numbers and not value[0] < value[1])):
+        raise ValueError(f"must be [lowest, highest]: {list(value)}")
+    return value
+
+
+Interval = Annotated[tuple[float, float], BeforeValidator(_interval)]
+
+
+class Limits(InterlockSettings):
+    """Limits of the run, for the limiter (the last block before the device) and the interlocks.
+
+    Attributes:
+        peak_current_a: Largest magnitude of the coil current, A, for devices driven in A.
+        drive_a: Lowest and highest coil current, A, instead of ``peak_current_a``: for supplies of
+            one sign.
+        slew_a_per_s: Fastest change of the coil current, A/s.
+        drive_v: Lowest and highest drive voltage, V, for devices driven in V.
+        slew_v_per_s: Fastest change of the drive voltage, V/s.
+        stroke_um: Lowest and highest measured displacement, um; outside, the run ends with its safe
+            ramp.
+        aux: Highest value of an auxiliary channel of the device, or its lowest and highest value,
+            by name and in its unit. A missing value counts as outside after ``sensor_invalid_s``.
+    """
+
+    peak_current_a: Annotated[float, Field(gt=0.0)] | None = None
+    drive_a: Interval | None = None
+    slew_a_per_s: Annotated[float, Field(gt=0.0)] | None = None
+    drive_v: Interval | None = None
+    slew_v_per_s: Annotated[float, Field(gt=0.0)] | None = None
+    stroke_um: Interval
+    aux: dict[str, float | Interval] | None = None
+
+    @model_validator(mode="after")
+    def _one_unit(self) -> Self:
+        names = ("peak_current_a", "drive_a", "slew_a_per_s", "drive_v", "slew_v_per_s")
+        given = {name for name in names if getattr(self, name) is not None}
+        complete = (
+            {"peak_current_a", "slew_a_per_s"},
+            {"drive_a", "slew_a_per_s"},
+            {"drive_v", "slew_v_per_s"},
+        )
+        if given not in complete:
+            raise ValueError(
+                "must have peak_current_a (or drive_a) and slew_a_per_s for a device driven in A, "
+                "or drive_v and slew_v_per_s for a device driven in V"
+            )
+        return self
+
+    @property
+    def range_key(self) -> str:
+        """Key of the range of the command."""
+        keys = ("drive_v", "drive_a", "peak_current_a")
+        return next(key for key in keys if getattr(self, key) is not None)
+
+    @property
+    def unit(self) -> CommandUnit:
+        """Unit of the limited commands."""
+        return "V" if self.drive_v is not None else "A"
+
+    @property
+    def command_range(self) -> tuple[float, float]:
+        """Lowest and highest command, in :attr:`unit`."""
+        if (given := self.drive_v or self.drive_a) is not None:
+            return given
+        peak = self.peak_current_a or 0.0
+        return -peak, peak
+
+    @property
+    def slew_per_s(self) -> float:
+        """Fastest change of the command, in :attr:`unit` per second."""
+        return self.slew_v_per_s or self.slew_a_per_s or 0.0
+
+    def tracking(self, rate_hz: float) -> InterlockSettings:
+        """Return the interlocks of a compensated run, with the default of its tracking error."""
+        if "tracking_error_um" in self.model_fields_set:
+            return self
+        low_um, high_um = self.stroke_um
+        most_um, time_s = _TRACKING_SHARE * (high_um - low_um), max(_TRACKING_S, 1.0 / rate_hz)
+        return self.model_copy(update={"tracking_error_um": most_um, "tracking_s": time_s})
+
+
+def range_problems(limits: Limits, info: DeviceInfo) -> Iterator[ConfigProblem]:
+    """Yield the limits beyond the range of device and sensor."""
+    low, high = limits.command_range
+    unit = info.command_unit
+    if limits.unit != unit:
+        yield broken("limits", f"must be in {unit}, the unit of {info.name}", limits.unit)
+    elif low < info.command_min or high > info.command_max:
+        span = f"{info.command_min:g} to {info.command_max:g} {unit}"
+        rule = f"must lie within the range of {info.name}, {span}"
+        yield broken("limits", rule, f"{low:g} to {high:g}", _narrower(limits, info))
+    low_um, high_um = limits.stroke_um
+    if low_um < info.sensor_min_um or high_um > info.sensor_max_um:
+        span = f"{info.sensor_min_um:g} to {info.sensor_max_um:g} µm"
+        rule = f"must lie within the range of the sensor, {span}"
+        yield broken("limits.stroke_um", rule, f"{low_um:g} to {high_um:g}")
+
+
+def _narrower(limits: Limits, info: DeviceInfo) -> str:
+    """Return the largest limits within the range of a device; empty if there are none."""
+    low, high = limits.command_range
+    low, high = max(low, info.command_min), min(high, info.command_max)
+    if not low < high:
+        return ""
+    if limits.peak_current_a is None:
+        return f"set limits.{limits.range_key} to [{low!r}, {high!r}]"
+    if low < 0.0 < high:
+        return f"set limits.peak_current_a to {min(-low, high)!r}"
+    return f"set limits.drive_a to [{low!r}, {high!r}] instead of limits.peak_current_a"
+
+
+def interlock_problems(
+    limits: Limits, info: DeviceInfo, *, compensated: bool
+) -> Iterator[ConfigProblem]:
+    """Yield the interlocks whose requirements are not met."""
+    names = [each.name for each in info.aux]
+    known = f"must be an auxiliary channel of {info.name} ({', '.join(names) or 'it has none'})"
+    for name in limits.aux or {}:
+        if name not in names:
+            yield broken(f"limits.aux.{name}", known)
+    for key, field in InterlockSettings.model_fields.items():
+        if getattr(limits, key) is not None:
+            for needs in field.metadata:
+                if isinstance(needs, InterlockRequirement):
+                    for rule in _unmet(needs, limits, info, compensated=compensated):
+                        yield broken(f"limits.{key}", rule)
+
+
+def _unmet(
+    needs: InterlockRequirement, limits: Limits, info: DeviceInfo, *, compensated: bool
+) -> Iterator[str]:
+    if needs.unit is not None and needs.unit != limits.unit:
+        yield f"is for a device driven in {needs.unit}, but the limits are in {limits.unit}"
+    if needs.key is not None and getattr(limits, needs.key) is None:
+        unit = f"_{limits.unit.lower()}" if needs.key == "measured_deviation" else ""
+        yield f"needs limits.{needs.key}{unit}"
+    if needs.reference_um and not compensated:
+        yield "needs a compensator: without one there is no reference in um to track"
+    if needs.measured and not info.measures_command:
+        yield f"needs a device that measures its command: {info.name} does not"
+
+
+def reference_problems(
+    limits: Limits,
+    waveform: AnyWaveform,
+    span: tuple[float, float],
+    identified: tuple[float, float] | None = None,
+) -> Iterator[ConfigProblem]:
+    """Yield the ranges that a reference in um with this span leaves.
+
+    ``identified`` is the range that the model was identified on; None if it is unknown.
+    """
+    ranges = {"limits.stroke_um": limits.stroke_um}
+    if identified is not None:
+        ranges["the range that compensator.model was identified on"] = identified
+    for name, (lowest, highest) in ranges.items():
+        excess = max(lowest - span[0], span[1] - highest)
+        if excess > 0.0:
+            rule = f"reference must stay within {name}, {lowest:g} to {highest:g} µm"
+            hint = f"{excess:.3g} µm too far: {fitting(waveform, span, (lowest, highest))}"
+            yield broken("waveform", rule, f"{span[0]:.6g} to {span[1]:.6g} µm", hint)
+
+
+def command_problems(limits: Limits, rig: RunRig, course: Course) -> Iterator[ConfigProblem]:
+    """Yield the limits that the commands of a run exceed, by how much, and when.
+
+    An excess below a step of the output is none: the limiter takes it away.
+    """
+    forecast, unit = course.forecast, limits.unit
+    span = forecast.command_min, forecast.command_max
+    text = f"{span[0]:.6g} to {span[1]:.6g} {unit}"
+    if not all(map(math.isfinite, span)):
+        yield broken("compensator.model", "every command must be a finite number", text)
+        return
+    low, high = limits.command_range
+    if (excess := _excess(limits, forecast)) > rig.info.command_step:
+        at_s = forecast.lowest_at_s if low - span[0] == excess else forecast.highest_at_s
+        change = smaller(course, excess) or fitting(course.waveform, span, (low, high))
+        raised = _wider(limits, rig.info, forecast)
+        hint = cure(f"{excess:.3g} {unit}", course, at_s, change, raised)
+        rule = f"the run must stay within {low:g} to {high:g} {unit}"
+        yield broken(f"limits.{limits.range_key}", rule, text, hint)
+    excess = forecast.slew_per_s - limits.slew_per_s
+    if excess > 0.0:
+        key = f"limits.slew_{unit.lower()}_per_s"
+        raised = f"raise {key} to {rounded_up(forecast.slew_per_s):g}"
+        hint = cure(f"{excess:.3g} {unit}/s", course, forecast.fastest_at_s, SLOWER, raised)
+        rule = f"the run must change no faster than {limits.slew_per_s:g} {unit}/s"
+        yield broken(key, rule, f"{forecast.slew_per_s:.6g}", hint)
+    yield from _voltage_problems(rig, course)
+    yield from _budget_problems(limits, rig, course)
+
+
+def _voltage_problems(rig: RunRig, course: Course) -> Iterator[ConfigProblem]:
+    forecast, amplifier = course.forecast, rig.amplifier
+    needed_v, at_s = forecast.voltage_v, forecast.voltage_at_s
+    if amplifier is None or needed_v is None or needed_v <= amplifier.voltage_max_v:
+        return
+    low, high = forecast.command_min, forecast.command_max
+    excess_v, change = needed_v - amplifier.voltage_max_v, SLOWER
+    if at_s < forecast.before_s:
+        change = "lower the condition's frequency_hz or amplitude_a"
+    elif max(-low, high) > amplifier.held_a:
+        held = f"{amplifier.voltage_max_v:g} V hold at most {amplifier.held_a:.4g} A"
+        change = f"lower amplitude or offset, because {held}"
+    elif at_s > forecast.before_s:  # not the step to the first command
+        # The voltage of the mean command does not decrease with the amplitude.
+        alternating_v = needed_v - amplifier.resistance_ohm * abs(0.5 * (low + high))
+        if less := smaller(course, 0.5 * (high - low) * excess_v / alternating_v):
+            change = f"lower the frequency, {less}"
+    raised = f"use an amplifier of {rounded_up(needed_v):g} V"
+    hint = cure(f"{excess_v:.3g} V", course, at_s, change, raised)
+    rule = f"the voltage of the run must be <= {amplifier.voltage_max_v:g} V"
+    yield broken("amplifier.voltage_max_v", rule, f"{needed_v:.4g} V", hint)
+
+
+def _budget_problems(limits: Limits, rig: RunRig, course: Course) -> Iterator[ConfigProblem]:
+    forecast = course.forecast
+    rms_a, highest_a, used_s = limits.rms_current_a, forecast.heating_rms_a, forecast.budget_used_s
+    if used_s is None or highest_a is None or rms_a is None:
+        return
+    left_s, safe = used_s - forecast.before_s, rig.command.safe
+    change = (
+        f"lower the waveform's amplitude or offset, or end it within {-rounded_up(-left_s):g} s"
+    )
+    if abs(safe) > rms_a:
+        change = "lower safe.value"
+    elif left_s <= 0.0:
+        change = "lower the condition's amplitude or cycles"
+    hint = cure(f"{highest_a - rms_a:.3g} A", course, used_s, change)
+    begins_a = forecast.begins_rms_a or 0.0
+    pause_s = CoolingCoil(rig, begins_a**2, 0.0).pause_s(forecast.heat, 0.0)
+    if pause_s > 0.0 and forecast.heat.hottest_a2 > safe**2:
+        hint = f"it begins at {begins_a:.3g} A rms, left by the last run: wait {pause_s:.0f} s"
+    rule = f"the coil must stay within {rms_a:g} A rms over {limits.thermal_time_constant_s:g} s"
+    yield broken("limits.rms_current_a", rule, f"{highest_a:.4g} A", hint)
+
+
+def _wider(limits: Limits, info: DeviceInfo, forecast: Forecast) -> str:
+    """Return the limit that a run needs, or that its device has no such range."""
+    low, high = limits.command_range
+    low = min(low, -rounded_up(-forecast.command_min))
+    high = max(high, rounded_up(forecast.command_max))
+    span = f"[{low!r}, {high!r}]"
+    if limits.peak_current_a is not None:
+        high = max(high, -low)
+        low, span = -high, f"{high:g}"
+    if info.command_min <= low and high <= info.command_max:
+        return f"raise limits.{limits.range_key} to {span} if the actuator allows it"
+    span = f"{info.command_min:g} to {info.command_max:g} {info.command_unit}"
+    return f"use a device with a larger range than {info.name}, {span}"
+
+
+def _excess(limits: Limits, forecast: Forecast) -> float:
+    """Return by how much commands exceed their range; 0 for rounding errors."""
+    low, high = limits.command_range
+    excess = max(low - forecast.command_min, forecast.command_max - high)
+    return excess if excess > _ROUNDING * (high - low) else 0.0
+
+
+def clamp_warnings(limits: Limits, rig: RunRig, forecast: Forecast) -> tuple[str, ...]:
+    """Return a warning if commands exceed their range by less than a step of the output."""
+    if not (excess := _excess(limits, forecast)):
+        return ()
+    return (
+        f"limits.{limits.range_key}: commands exceed it by {excess:.2g} {limits.unit}, less than a "
+        f"step of the output, {rig.info.command_step:.2g} {limits.unit}: the limiter clamps them",
+    )

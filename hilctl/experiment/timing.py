@@ -1,0 +1,126 @@
+"""The ``timing`` section: late ticks, deadline misses, and the silence of a hung loop.
+
+The guardian imports this module, so it must not import numba.
+"""
+
+import math
+from collections.abc import Mapping
+from dataclasses import dataclass
+from typing import Annotated, ClassVar, Literal
+
+from hilctl.base.device import DeviceInfo
+from hilctl.base.strict import Field, StrictModel
+from hilctl.loop.pacer import USUAL_MISSED_SHARE, LatePolicy, LateRules
+
+SHORTEST_TICK_S = 1e-4
+"""Shortest tick that timers keep on most machines: an idle CPU takes up to 0.1 ms to wake."""
+_ALWAYS_LATE_S = 2.0
+_MISSED_WINDOW_S = 10.0
+_SIMULATED_MARGIN_S = 0.5
+_HANG_S = 0.08
+_STOPPED_S = 0.02
+
+
+class Timing(StrictModel):
+    """Policy for late ticks.
+
+    A device paced by the host skips whole ticks in the waveform, and keeps the phase. A device with
+    its own sample clock catches up, because its FIFO takes the burst. Late ticks over two seconds
+    end the run.
+
+    Attributes:
+        late_after: Delay in tick periods after which a tick counts as late.
+        max_late_s: A tick later than this ends the run.
+        on_misses: Reaction to too many skipped ticks: ``fault`` ends the run with its safe ramp,
+            ``warn`` reports them after the run. The command is constant in a skipped tick and jumps
+            after it, so the output is no longer the checked waveform.
+        max_missed_share: Largest share of skipped ticks, over ten seconds or the whole waveform if
+            that is shorter; fewer than five stalls never end a run.
+        hang_s: A loop without heartbeat for this time and two tick periods is killed and the output
+            set to the safe value; ``max_late_s`` is added while it waits for the device. Default:
+            80 ms; ``max_late_s`` and half a second for a simulated device, which has no coil to
+            protect. A stopped process (SIGSTOP) is limited to 20 ms if there is a coil.
+    """
+
+    REMOVED: ClassVar[Mapping[str, str]] = {
+        "late_policy": "removed: late ticks are skipped; delete the key",
+        "max_consecutive_late": "removed: two seconds of late ticks end a run; set late_after",
+        "grace_s": "removed: set on_misses: warn, or a larger max_late_s",
+    }
+
+    late_after: Annotated[float, Field(gt=0.0)] = 0.5
+    max_late_s: Annotated[float, Field(gt=0.0)] = 1.0
+    on_misses: Literal["warn", "fault"] = "fault"
+    max_missed_share: Annotated[float, Field(ge=0.0, lt=1.0)] = USUAL_MISSED_SHARE
+    hang_s: Annotated[float, Field(ge=0.02, le=60.0)] | None = None
+
+
+@dataclass(frozen=True, slots=True)
+class SilenceLimits:
+    """Longest silence of the loop before it counts as hung."""
+
+    real_time_s: float  # with real-time priority
+    ordinary_s: float  # without real-time priority, on a busy computer
+    exchange_s: float  # added while it waits for the device
+    stopped_s: float  # while its process is stopped, such as by SIGSTOP
+
+
+def timeout_warnings(timing: Timing, timeout_s: object) -> tuple[str, ...]:
+    """Return a warning if the device's timeout exceeds the time that a run waits for an answer."""
+    limit_s = timing.max_late_s
+    if not isinstance(timeout_s, int | float) or timeout_s <= limit_s:
+        return ()
+    return (
+        f"device.timeout_s: {timeout_s:g} s is longer than timing.max_late_s, {limit_s:g} s, but "
+        "an exchange that takes longer than max_late_s ends the run. Lower timeout_s, or raise "
+        "max_late_s.",
+    )
+
+
+def pace_warnings(tick_s: float, info: DeviceInfo) -> tuple[str, ...]:
+    """Return a warning if many ticks will be late; none for a device with its own clock."""
+    if info.latency_blocks or tick_s >= SHORTEST_TICK_S:
+        return ()
+    remedy = "Use a larger block." if info.buffered else "Use a lower rate."
+    return (
+        f"sample_rate_hz: {1.0 / tick_s:g} ticks per second: on most machines timers wake "
+        f"the loop too late for some of them. {remedy}",
+    )
+
+
+def late_policy(info: DeviceInfo) -> LatePolicy:
+    """Return what follows a late tick with a device."""
+    if info.latency_blocks:
+        return "follow"
+    return "catch_up" if info.buffered else "skip"
+
+
+def late_rules(timing: Timing, tick_s: float, ticks: int) -> LateRules:
+    """Return the rules on late ticks for a waveform of so many ticks."""
+    window = min(round(_MISSED_WINDOW_S / tick_s), ticks)
+    return LateRules(
+        late_after_ns=timing.late_after * tick_s * 1e9,
+        max_late_ns=timing.max_late_s * 1e9,
+        max_consecutive_late=math.ceil(_ALWAYS_LATE_S / tick_s),
+        missed_window=max(1, window),
+        max_missed=timing.max_missed_share * window if timing.on_misses == "fault" else math.inf,
+    )
+
+
+def silence_limits(timing: Timing, tick_s: float, *, simulated: bool) -> SilenceLimits:
+    """Return the longest silence of the loop of an experiment."""
+    hang_s = ordinary_s = timing.hang_s
+    if hang_s is None or ordinary_s is None:
+        # Without real-time priority the loop may be as late as its own limit allows.
+        ordinary_s = timing.max_late_s + (_SIMULATED_MARGIN_S if simulated else 0.0)
+        hang_s = ordinary_s if simulated else min(_HANG_S, ordinary_s)
+    periods_s = 2.0 * tick_s
+    return SilenceLimits(
+        real_time_s=periods_s + hang_s,
+        ordinary_s=periods_s + ordinary_s,
+        # An exchange that takes longer makes the next tick too late, which ends the run as well.
+        # Not the device's timeout, which may be long: until the answer the output stays driven.
+        exchange_s=timing.max_late_s,
+        # A stopped simulated loop may be under a debugger; no device needs protection.
+        stopped_s=periods_s + (hang_s if simulated else min(hang_s, _STOPPED_S)),
+    )
