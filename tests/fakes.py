@@ -23,6 +23,7 @@ from hilctl.loop.block import Block
 from hilctl.loop.interlocks import AuxLimit, InterlockContext, Interlocks, InterlockSettings
 from hilctl.loop.plan import AxisPlan, LoopPlan
 from hilctl.run.run_folder import DeviceLocks
+from hilctl_drivers.dac import ModbusStream
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
@@ -457,6 +458,13 @@ class InProcess:
         device = EmulatedModbus(loaded, bench, output, sensor, current_a)
         wire = ModbusWire("tcp", {loaded.unit_id: device})
         return cls(device, rig, link(wire, time, message_s), time, writes)
+
+    def stream(self, options):
+        """Return a modbus_stream on this device and in its time."""
+        device = ModbusStream(options, self.link)
+        buffer = device._wire.buffer
+        buffer.sleep, buffer.clock = self.time.sleep, self.time
+        return device
 
     @property
     def options(self):

@@ -1,22 +1,16 @@
-"""A DAC's options resolved against the profiles, and the session that reads its sensor.
+"""A DAC's options resolved against the profiles."""
 
-The sensor is read by the device with the output or by another one, the reader, of any protocol. The
-reader has a link of its own, or shares the line or connection of the output.
-"""
-
-import math
-from abc import ABC, abstractmethod
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 from functools import partial
-from pkgutil import resolve_name
-from typing import Any, ClassVar, Literal, Self, cast
+from typing import Any, Literal, Self, cast
 
 from hilctl.base.device import AuxChannel, DeviceInfo
 from hilctl.base.errors import InputError
 from hilctl_drivers.device import details_of
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.profile_base import BaseProfile, Range
+from hilctl_drivers.session import SensorReader, SteppedSession, session_class
 from hilctl_drivers.signal_chain import (
     AuxInput,
     DacOptions,
@@ -38,7 +32,7 @@ class AuxSource:
     input: Range
     options: AuxInput
 
-    def value(self, reader: "SensorReader") -> float:
+    def value(self, reader: SensorReader) -> float:
         """Return the value of the channel."""
         with ErrorPrefix(f"aux.{self.channel.name}"):
             return self.scaled(reader.read())
@@ -108,32 +102,39 @@ class DacSetup:
     @property
     def read_time(self) -> WireTime:
         """Time of reading the input alone."""
-        return _reader_class(self.reader).time(self.reader.profile, self.input)
+        return session_class(self.reader).read_time(self.reader.profile, self.input)
 
-    def reader_on(self, link: Link) -> "SensorReader":
-        """Return the session that reads the sensor; it uses the output's link if it shares it."""
-        return _reader_class(self.reader)(self, link)
+    def reader_on(self, link: Link) -> SensorReader:
+        """Return what reads the sensor; it uses the output's link if it shares it."""
+        own = self.reads_elsewhere and not self.shares_link
+        return SensorReader(self.reader, self.input, link, self.reader_name, own=own)
 
-    def aux_readers(self, link: Link, reader: "SensorReader | None") -> list[Callable[[], float]]:
+    def aux_readers(self, link: Link, reader_link: Link) -> list[Callable[[], float]]:
         """Return functions that read the auxiliary channels on the open links."""
         found: list[Callable[[], float]] = []
         for each in self.aux:
-            shared = link if each.holder is self.writer or reader is None else reader.link
-            own = replace(self, writer=each.holder, reader=each.holder, input=each.input)
-            found.append(partial(each.value, own.reader_on(shared)))
+            shared = link if each.holder is self.writer else reader_link
+            found.append(partial(each.value, SensorReader(each.holder, each.input, shared)))
         return found
 
     @property
-    def session_class(self) -> "type[SessionReader]":
-        """Sessions of the protocol of a writer whose profile has steps."""
-        return cast("type[SessionReader]", _reader_class(self.writer))
+    def _stepped(self) -> type[SteppedSession]:
+        """Sessions of a writer whose profile has steps."""
+        return cast("type[SteppedSession]", session_class(self.writer))
 
     @property
     def digital_time(self) -> WireTime | None:
         """Time to set the digital output; None without one."""
         if self.digital_output is None:
             return None
-        return self.session_class.digital_time(self.writer.profile, self.digital_output)
+        return self._stepped.digital_time(self.writer.profile, self.digital_output)
+
+    @property
+    def feed_time(self) -> WireTime | None:
+        """Time to feed the watchdog of the experiment once; None if nothing is sent."""
+        if self.options.watchdog == "none":
+            return None
+        return self._stepped.feed_time(self.writer.profile)
 
     def check_timeout(self, wire: WireTime) -> None:
         """Raise InputError if an answer cannot come within the timeout."""
@@ -147,7 +148,7 @@ class DacSetup:
         It includes the slowest auxiliary channel, and setting the digital output.
         """
         if self.aux:
-            times = [_reader_class(e.holder).time(e.holder.profile, e.input) for e in self.aux]
+            times = [session_class(e.holder).read_time(e.holder.profile, e.input) for e in self.aux]
             slowest = max(times, key=lambda each: each.total_s)
             wire = wire.then(slowest.named("for an auxiliary channel"))
         if (pulse := self.digital_time) is not None:
@@ -220,7 +221,7 @@ class DacSetup:
             identity=writer.identity(held),
             output=f"{unit}{getattr(self.output, 'address', options.output)}",
             details=details,
-            ages_readings=_reader_class(self.reader).AGES,
+            ages_readings=session_class(self.reader).AGES,
             aux=tuple(each.channel for each in self.aux),
             digital_output=options.digital_output or "",
             digital_output_s=0.0 if (pulse := self.digital_time) is None else pulse.total_s,
@@ -229,13 +230,9 @@ class DacSetup:
         )
 
 
-def _reader_class(holder: Endpoint) -> "type[SensorReader]":
-    return cast("type[SensorReader]", resolve_name(holder.profile.READER))
-
-
 def _aux_source(name: str, options: AuxInput, reader: Endpoint, writer: Endpoint) -> AuxSource:
     """Return an auxiliary channel; raise InputError if no device can read its input."""
-    holders = [each for each in (reader, writer) if _reader_class(each).READS_ANY]
+    holders = [each for each in (reader, writer) if session_class(each).READS_ANY]
     for holder in holders:
         if (source := holder.profile.inputs.get(options.input)) is not None:
             unit = (source.unit if options.unit is None else options.unit).replace("degC", "°C")
@@ -257,141 +254,3 @@ def _digital(options: DacOptions, profile: BaseProfile, kind: Literal["output", 
         hint = "'hilctl devices' lists the profiles with one"
         raise InputError(f"digital_{kind} must be omitted: {has}; {hint}")
     return channel(f"digital_{kind}", name, known, profile.title)
-
-
-class SensorReader(ABC):
-    """Session with the device that has the input; each protocol has one.
-
-    If it is another device than the output's, its errors name it, and it is identified, set up and
-    finished here. It has a link of its own, or shares that of the output.
-    """
-
-    AGES: ClassVar[bool] = False
-    """Whether the device sends unasked, so that its readings have an age."""
-    READS_ANY: ClassVar[bool] = True
-    """Whether it can read any input of the device in a request of its own."""
-    age_s = math.nan
-    """Age of the last reading, if it has one."""
-
-    def __init__(self, setup: DacSetup, link: Link) -> None:
-        """Take the output's link; nothing is sent before :meth:`open`."""
-        self._name = setup.reader_name
-        self._own: Any = None
-        if setup.reads_elsewhere and not setup.shares_link:
-            self._own = self._new_link(setup.reader)
-        self.link: Link = self._own or link
-
-    @staticmethod
-    @abstractmethod
-    def time(profile: Any, source: Any) -> WireTime:
-        """Return the time of reading an input."""
-
-    @property
-    def lost(self) -> int:
-        """Number of readings since :meth:`start` that did not arrive, if they are counted."""
-        return 0
-
-    def open(self) -> None:
-        """Connect and identify the device."""
-        if self._name:
-            with ErrorPrefix(self._name):
-                if self._own is not None:
-                    self._own.open()
-                self._identify()
-
-    def begin(self) -> None:
-        """Run the init steps, and read once: a wrong input must show before the output moves."""
-        if self._name:
-            with ErrorPrefix(self._name):
-                self._set_up()
-                self._read()
-
-    def start(self) -> None:  # noqa: B027  most devices send nothing unasked
-        """Discard what has arrived before the first exchange."""
-
-    def read(self) -> float:
-        """Return the value of the input in its unit."""
-        with ErrorPrefix(self._name):
-            return self._read()
-
-    def end(self) -> None:
-        """Run the close steps."""
-        if self._name:
-            with ErrorPrefix(self._name):
-                self._finish()
-
-    def release(self) -> None:
-        """Close its own link."""
-        if self._own is not None:
-            self._own.close()
-
-    def _new_link(self, reader: Endpoint) -> Any:
-        """Return a link to the device, with ``open`` and ``close``."""
-        return reader.link()
-
-    @abstractmethod
-    def _identify(self) -> None:
-        """Raise DeviceError if it is another device."""
-
-    def _set_up(self) -> None:  # noqa: B027  a board has no steps
-        """Run the init steps."""
-
-    @abstractmethod
-    def _read(self) -> float:
-        """Return the value of the input in its unit."""
-
-    def _finish(self) -> None:  # noqa: B027  a board has no steps
-        """Run the close steps."""
-
-
-class SessionReader(SensorReader):
-    """A reader whose session runs the steps of a profile; each protocol has its session."""
-
-    def __init__(self, setup: DacSetup, link: Link) -> None:
-        super().__init__(setup, link)
-        self._session = self.session_on(setup.reader, self.link)
-        self._read_input = self._session.input_reader(setup.input)
-
-    @staticmethod
-    @abstractmethod
-    def session_on(endpoint: Endpoint, link: Link) -> Any:
-        """Return a session with the device."""
-
-    @staticmethod
-    @abstractmethod
-    def digital_time(profile: Any, output: Any) -> WireTime:
-        """Return the time of setting a digital output."""
-
-    @staticmethod
-    @abstractmethod
-    def steps_time(profile: Any, steps: Any) -> WireTime:
-        """Return the longest time of steps; a step that may write counts as one that does."""
-
-    @classmethod
-    def feed_time(cls, profile: Any) -> WireTime | None:
-        """Return the time to feed the device's watchdog once; None if exchanges feed it."""
-        watchdog = profile.watchdog
-        if watchdog == "none" or watchdog.kick != "strict":
-            return None
-        return cls.steps_time(profile, watchdog.feed).named("to feed the watchdog")
-
-    @classmethod
-    def arm_s(cls, profile: Any, output: str) -> float:
-        """Return the longest time to arm the device's watchdog, s; 0 without a watchdog."""
-        watchdog = profile.watchdog
-        if watchdog == "none":
-            return 0.0
-        steps = (*getattr(watchdog, "unlock", ()), *watchdog.arming(output))
-        return cls.steps_time(profile, steps).answered_s
-
-    def _identify(self) -> None:
-        self._session.check_selftest()
-
-    def _set_up(self) -> None:
-        self._session.run(self._session.profile.init)
-
-    def _read(self) -> float:
-        return float(self._read_input())
-
-    def _finish(self) -> None:
-        self._session.run(self._session.profile.close)

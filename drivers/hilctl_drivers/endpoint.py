@@ -72,11 +72,11 @@ class Endpoint:
         """Return a new link."""
         if self.framing == "tcp":
             return TcpLink(self.host, int(self.port), self.timeout_s)
-        return self.stream()
+        return self._stream()
 
-    def stream(self, extra_s: float = 0.0) -> StreamLink:
-        """Return a new link without framing; ``extra_s`` is added to the timeout of each answer."""
-        line, timeout_s = self.profile.link, self.timeout_s + extra_s
+    def _stream(self) -> StreamLink:
+        """Return a new link without framing."""
+        line, timeout_s = self.profile.link, self.timeout_s
         assert isinstance(line, StreamSettings), "Modbus TCP has framing"
         if self.host:
             port, gap_s = int(self.port), line.silence_s

@@ -275,7 +275,9 @@ class BaseProfile(StrictModel):
     """
 
     DEVICE: ClassVar[str]  # device kind of an experiment that uses such a profile
-    READER: ClassVar[str]  # the :class:`~hilctl_drivers.dac_setup.SensorReader` of its inputs
+    WIRES: ClassVar[Mapping[str, str]] = {}
+    """The :class:`~hilctl_drivers.wire.Wire` for each kind of device, by kind."""
+    SESSION: ClassVar[str]  # the :class:`~hilctl_drivers.session.Session` of its protocol
 
     vendor: Text = Field(description="manufacturer")
     model: Text = Field(description="model, as ordered")
@@ -323,11 +325,6 @@ class BaseProfile(StrictModel):
     def misfits(self) -> Iterator[tuple[str, str, str]]:
         """Yield the dotted key, the rule and the value of each text that does not fit the link."""
         return iter(())
-
-    @property
-    def driver(self) -> str:
-        """The :class:`~hilctl_drivers.wired_dac.SerialDac` for it; empty for other devices."""
-        return ""
 
     @property
     def framings(self) -> tuple[Literal["tcp", "rtu"], ...]:

@@ -27,9 +27,9 @@ from hilctl.base.yaml import Document, load_document
 BUILTIN: dict[str, str] = {
     "simulated_terfenol": "hilctl_drivers.simulated.devices:SimulatedTerfenol",
     "simulated_piezo": "hilctl_drivers.simulated.devices:SimulatedPiezo",
-    "modbus_dac": "hilctl_drivers.modbus.modbus_dac:ModbusDac",
-    "modbus_stream": "hilctl_drivers.labjack.modbus_stream:ModbusStream",
-    "serial_dac": "hilctl_drivers.wired_dac:SerialDac",
+    "modbus_dac": "hilctl_drivers.dac:ModbusDac",
+    "modbus_stream": "hilctl_drivers.dac:ModbusStream",
+    "serial_dac": "hilctl_drivers.dac:SerialDac",
 }
 GROUP = "hilctl.devices"
 SHIPPED_PROFILES = "hilctl_drivers.profile:shipped_profiles"

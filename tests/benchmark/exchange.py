@@ -21,7 +21,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
+from hilctl_drivers.dac import ModbusDac, ModbusOptions
 
 SOURCE = Path(__file__).with_suffix(".c")
 WARM_UP = 200
@@ -88,7 +88,7 @@ def driver_batch(folder: Path, link: str, **where: object) -> Batch:
     }
     device = ModbusDac(ModbusOptions.model_validate(options))
     device.open(1.0, 1)
-    assert device.one_transaction
+    assert device.transactions == 1
     command, displacement_um, measured = np.full(1, 1.5), np.zeros(1), np.zeros(1)
 
     def run(count: int, times_ns: np.ndarray) -> None:

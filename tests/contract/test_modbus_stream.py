@@ -29,12 +29,7 @@ class DrivenStream(DrivenDevice):
         self.emulated = InProcess.of(profile, message_s=0.0002)
         chosen = device_class("modbus_stream")
         options = {**self.emulated.options, "profile": profile, "fifo_blocks": FIFO_BLOCKS}
-        device = chosen(
-            chosen.Options.model_validate(options),
-            link=self.emulated.link,
-            sleep=self.emulated.time.sleep,
-            clock=self.emulated.time,
-        )
+        device = self.emulated.stream(chosen.Options.model_validate(options))
         super().__init__(device, BLOCK, RATE_HZ, lambda: self.current_a, name="modbus_stream")
 
     @property

@@ -51,7 +51,7 @@ TCP_FAULTS: dict[str, str] = {
     "corrupt": "not a Modbus TCP header",
     "reset": "connection lost: connection reset by peer",
 }
-"""Faults during a run; faults of the driver alone are in ``test_modbus_dac.py``."""
+"""Faults during a run; faults of the driver alone are in ``test_register_wire.py``."""
 
 
 @pytest.mark.parametrize("fault", each_kind(TCP_FAULTS, {"silence", "late:3", "corrupt"}))

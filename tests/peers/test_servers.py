@@ -16,7 +16,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
+from hilctl_drivers.dac import ModbusDac, ModbusOptions
 from tests.peers.conftest import read_line, running, serial_cable
 
 HERE = Path(__file__).parent
@@ -241,7 +241,7 @@ def test_finds_out_whether_a_sample_is_one_transaction(served):
     """Function 23 is used if the server supports it, otherwise a write and a read."""
     device = served.device()
     device.open(RATE_HZ, 1)
-    found = device.one_transaction
+    found = device.transactions == 1
     device.close()
     assert found == served.server.writes_and_reads
 

@@ -113,7 +113,7 @@ class SentBlocks:
 
         All blocks of before the previous exchange have arrived.
         """
-        arrived_ns = device._reader._arrived_ns
+        arrived_ns = device._reader.session._arrived_ns
         at_ns = arrived_ns + round(1e9 * device.reading_age_s)
         assert before_ns <= at_ns + 1
         assert at_ns <= time.monotonic_ns() + 1

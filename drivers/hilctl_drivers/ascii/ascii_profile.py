@@ -15,7 +15,7 @@ order are those of :mod:`hilctl_drivers.modbus.register_map`. The example shows 
 
 import math
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from string import Formatter
@@ -435,7 +435,8 @@ class AsciiProfile(BaseProfile):
     """A device with a text protocol or fixed frames."""
 
     DEVICE: ClassVar[str] = "serial_dac"
-    READER: ClassVar[str] = "hilctl_drivers.ascii.ascii_session:TextReader"
+    WIRES: ClassVar[Mapping[str, str]] = {"serial_dac": "hilctl_drivers.ascii.text_wire:TextWire"}
+    SESSION: ClassVar[str] = "hilctl_drivers.ascii.ascii_session:AsciiSession"
 
     link: Annotated[AsciiLink | AsciiTcpLink | BytesLink, Field(discriminator="kind")] = Field(
         description="serial line or TCP connection"
@@ -528,11 +529,6 @@ class AsciiProfile(BaseProfile):
     def usual_unit(self) -> int | None:
         """See :attr:`~hilctl_drivers.profile_base.BaseProfile.usual_unit`."""
         return None if self.address == "none" else self.address
-
-    @property
-    def driver(self) -> str:
-        """See :attr:`~hilctl_drivers.profile_base.BaseProfile.driver`."""
-        return "hilctl_drivers.ascii.ascii_dac:AsciiDac"
 
 
 _REQUESTS = {"write", "ask", "text", "high", "low"}

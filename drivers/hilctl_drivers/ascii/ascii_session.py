@@ -33,10 +33,10 @@ from hilctl_drivers.ascii.ascii_profile import (
     as_text,
     fill,
 )
-from hilctl_drivers.dac_setup import SessionReader
 from hilctl_drivers.endpoint import Endpoint
 from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.profile_base import WaitStep
+from hilctl_drivers.session import SteppedSession
 from hilctl_drivers.transport.crc import CRCS, Bytes, Crc, dcon_checksum, gen_checksum
 from hilctl_drivers.transport.framing import split_at
 from hilctl_drivers.transport.links import (
@@ -226,7 +226,7 @@ def reading(form: MeasuredReply, ask: Callable[..., re.Match[str]]) -> float:
     return parse_number(found[1], form.binary)
 
 
-class AsciiSession:
+class AsciiSession(SteppedSession):
     """A link to one device, which answers each line before the next is sent.
 
     Several devices may share a link. The address is as shipped if it is None.
@@ -248,6 +248,45 @@ class AsciiSession:
         watchdog = profile.watchdog
         self._refusal = "none" if watchdog == "none" else watchdog.refusal
         self.link = link
+
+    @classmethod
+    def on(cls, device: Endpoint, link: Link) -> "AsciiSession":
+        """See :meth:`~hilctl_drivers.session.Session.on`."""
+        return cls(cast(AsciiProfile, device.profile), link, device.unit)
+
+    @staticmethod
+    def read_time(profile: AsciiProfile, source: AsciiInput) -> WireTime:
+        """See :meth:`~hilctl_drivers.session.Session.read_time`."""
+        return query_time(profile, source).named(f"to {profile.title}")
+
+    @staticmethod
+    def digital_time(profile: AsciiProfile, output: AsciiDigitalOutput) -> WireTime:
+        """Return the time to set a digital output, with the longer line."""
+        texts = (fill(each, address=profile.unit) for each in (output.high, output.low))
+        return _lines_time(profile, [(max(texts, key=len), _example(output.reply))])
+
+    @staticmethod
+    def steps_time(profile: AsciiProfile, steps: Sequence[AsciiStep]) -> WireTime:
+        """See :meth:`~hilctl_drivers.session.SteppedSession.steps_time`."""
+        watchdog = profile.watchdog
+        timeout = 1 if watchdog == "none" else int(watchdog.max_s / watchdog.unit_s)
+        values = {"address": profile.unit, "timeout": timeout, "safe": 0.0}
+        lines: list[_Line] = []
+        for step in steps:
+            if isinstance(step, AskStep | NumberStep):
+                lines.append((fill(step.ask, **values), step.example))
+            elif isinstance(step, SendStep):
+                lines.append((fill(step.text, **values), _example(step.reply)))
+        waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
+        return _lines_time(profile, lines).waiting(waits_s)
+
+    @classmethod
+    def arm_s(cls, profile: AsciiProfile, output: str) -> float:
+        """Return the time with a query of errors, see :class:`SteppedSession`."""
+        query, error_s = profile.error_query, 0.0
+        if query != "none" and profile.watchdog != "none":
+            error_s = _lines_time(profile, [(query.ask, query.example)]).answered_s
+        return super().arm_s(profile, output) + error_s
 
     def text(self, template: str, **values: float) -> str:
         """Return a template with its fields filled in."""
@@ -339,7 +378,7 @@ class AsciiSession:
                 raise RefusedError(f"{text} says {reply}, {_ERRORS_MAX} times", reply)
         return found
 
-    def check_selftest(self) -> None:
+    def identify(self) -> None:
         """Run the self-test; raise DeviceError if it is another device."""
         test = self.profile.selftest
         if test != "none":
@@ -476,49 +515,6 @@ def exchange_time(profile: AsciiProfile, output: str, sensor: str | None) -> Wir
 def query_time(profile: AsciiProfile, query: AsciiInput) -> WireTime:
     """Return the time of a question besides the exchange."""
     return _lines_time(profile, [_question(profile, query)], query.settle_s)
-
-
-class TextReader(SessionReader):
-    """A :class:`~hilctl_drivers.dac_setup.SensorReader` for lines of text."""
-
-    @staticmethod
-    def session_on(endpoint: Endpoint, link: Link) -> AsciiSession:
-        """See :meth:`~hilctl_drivers.dac_setup.SessionReader.session_on`."""
-        return AsciiSession(cast(AsciiProfile, endpoint.profile), link, endpoint.unit)
-
-    @staticmethod
-    def time(profile: AsciiProfile, source: AsciiInput) -> WireTime:
-        """See :meth:`~hilctl_drivers.dac_setup.SensorReader.time`."""
-        return query_time(profile, source).named(f"to {profile.title}")
-
-    @staticmethod
-    def digital_time(profile: AsciiProfile, output: AsciiDigitalOutput) -> WireTime:
-        """Return the time to set a digital output, with the longer line."""
-        texts = (fill(each, address=profile.unit) for each in (output.high, output.low))
-        return _lines_time(profile, [(max(texts, key=len), _example(output.reply))])
-
-    @staticmethod
-    def steps_time(profile: AsciiProfile, steps: Sequence[AsciiStep]) -> WireTime:
-        """See :meth:`~hilctl_drivers.dac_setup.SessionReader.steps_time`."""
-        watchdog = profile.watchdog
-        timeout = 1 if watchdog == "none" else int(watchdog.max_s / watchdog.unit_s)
-        values = {"address": profile.unit, "timeout": timeout, "safe": 0.0}
-        lines: list[_Line] = []
-        for step in steps:
-            if isinstance(step, AskStep | NumberStep):
-                lines.append((fill(step.ask, **values), step.example))
-            elif isinstance(step, SendStep):
-                lines.append((fill(step.text, **values), _example(step.reply)))
-        waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
-        return _lines_time(profile, lines).waiting(waits_s)
-
-    @classmethod
-    def arm_s(cls, profile: AsciiProfile, output: str) -> float:
-        """Return the time with a query of errors, see :class:`SessionReader`."""
-        query, error_s = profile.error_query, 0.0
-        if query != "none" and profile.watchdog != "none":
-            error_s = _lines_time(profile, [(query.ask, query.example)]).answered_s
-        return super().arm_s(profile, output) + error_s
 
 
 def _example(reply: Reply | Literal["none"]) -> str | None:

@@ -1,5 +1,6 @@
 """Profiles of microcontroller boards; messages are in :mod:`hilctl_drivers.board.frames`."""
 
+from collections.abc import Mapping
 from typing import ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
@@ -80,7 +81,8 @@ class FrameProfile(BaseProfile):
     """A board with binary frames."""
 
     DEVICE: ClassVar[str] = "serial_dac"
-    READER: ClassVar[str] = "hilctl_drivers.board.board_dac:BoardReader"
+    WIRES: ClassVar[Mapping[str, str]] = {"serial_dac": "hilctl_drivers.board.board_wire:BoardWire"}
+    SESSION: ClassVar[str] = "hilctl_drivers.board.board_session:BoardSession"
 
     link: FramesLink = Field(description="serial line and framing")
     protocol: Literal["hilctl-1", "hilctl-2"] = Field(
@@ -117,9 +119,3 @@ class FrameProfile(BaseProfile):
                 f" {self.link.payload_max}"
             )
         return self
-
-    @property
-    def driver(self) -> str:
-        """See :attr:`~hilctl_drivers.profile_base.BaseProfile.driver`."""
-        name = "BoardSingle" if self.streaming == "none" else "BoardStream"
-        return f"hilctl_drivers.board.board_dac:{name}"

@@ -1,9 +1,10 @@
-"""Session with a microcontroller board: one message, one reply, fully checked."""
+"""Session with a microcontroller board: one message, one reply, fully checked; and times."""
 
 import math
-from dataclasses import dataclass
+from collections.abc import Callable
+from dataclasses import dataclass, replace
 from struct import Struct
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 
@@ -11,6 +12,9 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.board import frames as board
 from hilctl_drivers.board.board_profile import FrameChannel, FrameProfile
+from hilctl_drivers.endpoint import Endpoint
+from hilctl_drivers.profile_base import Range
+from hilctl_drivers.session import Session
 from hilctl_drivers.transport.framing import binary_framing
 from hilctl_drivers.transport.links import (
     ECHOED,
@@ -21,8 +25,11 @@ from hilctl_drivers.transport.links import (
     RefusedError,
     WatchdogTrippedError,
 )
+from hilctl_drivers.transport.wire_time import WireTime
 
 _NO_FIELDS = Struct("")
+_USB_BITS_PER_S = {True: 19 * 64 * 8e3, False: 13 * 512 * 8 * 8e3}
+"""Bulk payload of full-speed (1 ms) and high-speed (125 us) frames (USB 2.0, tables 5-9, 5-10)."""
 _CODES = {"int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32": "f4",
           "float64": "f8"}  # fmt: skip
 _REASONS = {
@@ -106,8 +113,10 @@ class BoardState:
     reading: float
 
 
-class BoardSession:
+class BoardSession(Session):
     """A link to one board, which answers each message before the next is sent."""
+
+    READS_ANY = False
 
     def __init__(self, profile: FrameProfile, link: Link) -> None:
         framing = profile.link.framing
@@ -117,6 +126,26 @@ class BoardSession:
         self.outputs = BoardValues(next(iter(profile.outputs.values())))
         # A board without an input sends a reading too, as its output is.
         self.inputs = BoardValues(next(iter((profile.inputs or profile.outputs).values())))
+
+    @classmethod
+    def on(cls, device: Endpoint, link: Link) -> "BoardSession":
+        """See :meth:`~hilctl_drivers.session.Session.on`."""
+        return cls(cast(FrameProfile, device.profile), link)
+
+    @staticmethod
+    def read_time(profile: FrameProfile, source: Range) -> WireTime:
+        """See :meth:`~hilctl_drivers.session.Session.read_time`; it is read with STATE."""
+        values = (*profile.outputs.values(), *profile.inputs.values())
+        wire = _message_time(profile, board.state_sizes(sum(each.format.size for each in values)))
+        return replace(wire, what=f"STATE {wire.what}", settle_s=source.settle_s)
+
+    def identify(self) -> None:
+        """See :meth:`facts`."""
+        self.facts()
+
+    def input_reader(self, source: Range) -> Callable[[], float]:
+        """See :meth:`~hilctl_drivers.session.Session.input_reader`; there is one input."""
+        return lambda: self.known_state().reading
 
     def ask(
         self, kind: int, body: bytes = b"", fields: Struct = _NO_FIELDS
@@ -247,3 +276,43 @@ def _raise_refusal(status: int) -> None:
     reasons = [text for bit, text in _REASONS.items() if status & bit]
     known = ", ".join(reasons) or f"status {status:02x}"
     raise RefusedError(f"refused by the board: {known}", status)
+
+
+def exchange_time(profile: FrameProfile, block: int = 1) -> WireTime:
+    """Return the time of an exchange of ``block`` samples, more than one for a stream only.
+
+    Outputs of a stream settle while the next messages pass.
+    """
+    stream = profile.exchange == "stream"
+    wire = _message_time(profile, board.exchange_sizes(block, _value_bytes(profile), stream=stream))
+    what = f"{block} {'sample' if block == 1 else 'samples'} in {profile.link.framing} frames"
+    settle = 0.0 if stream else settle_s(profile)
+    return replace(wire, what=f"{what} {wire.what}", samples=block, settle_s=settle)
+
+
+def settle_s(profile: FrameProfile) -> float:
+    """Return the time that output and input take to settle, s."""
+    channels = (*profile.outputs.values(), *profile.inputs.values())
+    return sum(channel.settle_s for channel in channels)
+
+
+def _value_bytes(profile: FrameProfile) -> int:
+    return next(iter(profile.outputs.values())).format.size
+
+
+def watchdog_time(profile: FrameProfile) -> WireTime:
+    """Return the time to set the watchdog."""
+    return _message_time(profile, board.watchdog_sizes(_value_bytes(profile)))
+
+
+def _message_time(profile: FrameProfile, sizes: tuple[int, int]) -> WireTime:
+    """Return the time of a message and its reply, with the line as text."""
+    link = profile.link
+    byte_s, gaps, gaps_s, line = link.char_s, 0, 0.0, link.medium
+    if link.usb:
+        full_speed = link.usb_frame_s >= 1e-3
+        byte_s, gaps, gaps_s = 8.0 / _USB_BITS_PER_S[full_speed], 1, link.usb_frame_s
+        line = f"over {'full' if full_speed else 'high'}-speed USB"
+    framing = binary_framing(link.framing, link.crc, link.payload_max)
+    request_s, reply_s = (framing.wire_size(size) * byte_s for size in sizes)
+    return WireTime(line, request_s, reply_s, gaps, gaps_s, profile.turnaround_s)

@@ -18,6 +18,7 @@ from hilctl.base.files import TextFiles
 from hilctl.base.formatting import finite_json
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, load_document
+from hilctl_drivers.dac import SerialOptions
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.options import (
     KINDS,
@@ -32,7 +33,6 @@ from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import NamedProfile, shipped_profiles
 from hilctl_drivers.signal_chain import AddressOptions, DacOptions
 from hilctl_drivers.simulated.devices import SimulatedOptions
-from hilctl_drivers.wired_dac import SerialOptions
 
 _UNPRIVILEGED = 1024
 _HERE = ("127.0.0.1", "::1", "localhost")

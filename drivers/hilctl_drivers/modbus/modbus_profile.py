@@ -1,6 +1,6 @@
 """Profiles of Modbus devices (TCP and RTU), including streaming."""
 
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from itertools import combinations
 from typing import Annotated, ClassVar, Literal, Self
 
@@ -205,7 +205,11 @@ class ModbusProfile(BaseProfile):
     """A Modbus device."""
 
     DEVICE: ClassVar[str] = "modbus_dac"
-    READER: ClassVar[str] = "hilctl_drivers.modbus.modbus_session:ModbusReader"
+    WIRES: ClassVar[Mapping[str, str]] = {
+        "modbus_dac": "hilctl_drivers.modbus.register_wire:RegisterWire",
+        "modbus_stream": "hilctl_drivers.labjack.labjack_wire:LabJackWire",
+    }
+    SESSION: ClassVar[str] = "hilctl_drivers.modbus.modbus_session:ModbusSession"
 
     link: Annotated[
         ModbusTcpLink | ModbusRtuTcpLink | ModbusRtuLink, Field(discriminator="kind")

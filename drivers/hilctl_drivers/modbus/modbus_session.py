@@ -14,7 +14,6 @@ from functools import partial
 from typing import Literal, TypeAlias, cast
 
 from hilctl.base.errors import DeviceError
-from hilctl_drivers.dac_setup import SessionReader
 from hilctl_drivers.endpoint import Endpoint
 from hilctl_drivers.modbus import pdu as modbus
 from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusOutput, ModbusProfile
@@ -28,6 +27,7 @@ from hilctl_drivers.modbus.register_map import (
     StatusRegister,
 )
 from hilctl_drivers.profile_base import WaitStep
+from hilctl_drivers.session import SteppedSession
 from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
 from hilctl_drivers.transport.links import (
     ECHOED,
@@ -171,7 +171,7 @@ def combined_request(
     return None
 
 
-class ModbusSession:
+class ModbusSession(SteppedSession):
     """A link to one device, with one request at a time; every error is a ``DeviceError``."""
 
     def __init__(
@@ -190,6 +190,30 @@ class ModbusSession:
         self._sleep = sleep
         self.numbers = itertools.count(1)
         """Numbers of Modbus TCP requests."""
+
+    @classmethod
+    def on(cls, device: Endpoint, link: Link) -> "ModbusSession":
+        """See :meth:`~hilctl_drivers.session.Session.on`."""
+        assert device.unit is not None, "Modbus devices have an address"
+        framing: Literal["tcp", "rtu"] = "tcp" if device.framing == "tcp" else "rtu"
+        return cls(cast(ModbusProfile, device.profile), link, device.unit, framing=framing)
+
+    @staticmethod
+    def read_time(profile: ModbusProfile, source: ModbusInput) -> WireTime:
+        """See :meth:`~hilctl_drivers.session.Session.read_time`."""
+        return _requests_time(profile, read_requests(profile, source), source.settle_s)
+
+    @staticmethod
+    def digital_time(profile: ModbusProfile, output: DigitalRegister) -> WireTime:
+        """See :meth:`~hilctl_drivers.session.SteppedSession.digital_time`."""
+        return _requests_time(profile, [write_request(profile, output)])
+
+    @staticmethod
+    def steps_time(profile: ModbusProfile, steps: Sequence[ModbusStep]) -> WireTime:
+        """See :meth:`~hilctl_drivers.session.SteppedSession.steps_time`."""
+        requests = [pdu for step in steps for pdu in _step_requests(profile, step)]
+        waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
+        return _requests_time(profile, requests).waiting(waits_s)
 
     def prepare(self, pdu: bytes) -> Call:
         """Return a function that sends a request, and can be called many times."""
@@ -279,7 +303,7 @@ class ModbusSession:
             for step in steps
         )
 
-    def check_selftest(self) -> None:
+    def identify(self) -> None:
         """Raise DeviceError if the register of known content holds something else."""
         test = self.profile.selftest
         if test == "none":
@@ -388,16 +412,6 @@ def exchange_time(
     return _requests_time(profile, [*both, *after], written.settle_s + read.settle_s)
 
 
-def read_time(profile: ModbusProfile, source: ModbusInput) -> WireTime:
-    """Return the time to read an input."""
-    return _requests_time(profile, read_requests(profile, source), source.settle_s)
-
-
-def digital_time(profile: ModbusProfile, output: DigitalRegister) -> WireTime:
-    """Return the time to set a digital output."""
-    return _requests_time(profile, [write_request(profile, output)])
-
-
 def read_requests(profile: ModbusProfile, sensor: ModbusInput) -> list[bytes]:
     """Return the requests that read an input, and its validity if that is elsewhere."""
     requests, validity = [read_request(profile, sensor)], sensor.validity
@@ -427,25 +441,3 @@ def _step_requests(profile: ModbusProfile, step: ModbusStep) -> list[bytes]:
     if isinstance(step, EnsureStep):
         return [read, write, read]
     return [write, read] if step.verify else [write]
-
-
-class ModbusReader(SessionReader):
-    """A :class:`~hilctl_drivers.dac_setup.SensorReader` for Modbus."""
-
-    time = staticmethod(read_time)
-    digital_time = staticmethod(digital_time)
-
-    @staticmethod
-    def session_on(endpoint: Endpoint, link: Link) -> ModbusSession:
-        """See :meth:`~hilctl_drivers.dac_setup.SessionReader.session_on`."""
-        assert endpoint.unit is not None, "Modbus devices have an address"
-        framing: Literal["tcp", "rtu"] = "tcp" if endpoint.framing == "tcp" else "rtu"
-        profile = cast(ModbusProfile, endpoint.profile)
-        return ModbusSession(profile, link, endpoint.unit, framing=framing)
-
-    @staticmethod
-    def steps_time(profile: ModbusProfile, steps: Sequence[ModbusStep]) -> WireTime:
-        """See :meth:`~hilctl_drivers.dac_setup.SessionReader.steps_time`."""
-        requests = [pdu for step in steps for pdu in _step_requests(profile, step)]
-        waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
-        return _requests_time(profile, requests).waiting(waits_s)

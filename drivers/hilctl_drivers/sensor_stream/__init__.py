@@ -1,1 +1,1 @@
-"""Sensors that send samples unasked over TCP: profile, and the reader of the newest sample."""
+"""Sensors that send samples unasked over TCP: profile, session that takes the newest."""

@@ -77,7 +77,7 @@ class StreamProfile(BaseProfile):
     """A sensor that sends samples unasked."""
 
     DEVICE: ClassVar[str] = "serial_dac"
-    READER: ClassVar[str] = "hilctl_drivers.sensor_stream.stream_reader:StreamReader"
+    SESSION: ClassVar[str] = "hilctl_drivers.sensor_stream.stream_session:SensorStreamSession"
 
     link: SensorStreamLink = Field(description="TCP connection")
     header: StreamHeader = Field(description="header of a block")

@@ -75,9 +75,7 @@ class StreamLink(ABC):
     ) -> None:
         self._gap_s = gap_s
         self._echo = echo
-        self.timeout_s = timeout_s
-        """Longest time of one exchange, s."""
-        self._timeout_ms = math.ceil(timeout_s * 1e3)
+        self.set_timeout(timeout_s)
         self._clock = clock
         self._sleep = sleep
         self._fd = -1
@@ -87,6 +85,11 @@ class StreamLink(ABC):
         self._stale = True
         self._quiet_at = 0.0
         self._silent_hint = ""  # why there may be no answer; empty after the first one
+
+    def set_timeout(self, timeout_s: float) -> None:
+        """Set the longest time of one exchange, s."""
+        self.timeout_s = timeout_s
+        self._timeout_ms = math.ceil(timeout_s * 1e3)
 
     @property
     def is_open(self) -> bool:

@@ -5,10 +5,10 @@ from contextlib import ExitStack
 import numpy as np
 import pytest
 
+from hilctl_drivers.dac import SerialDac, SerialOptions
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.simulated.devices import TerfenolOptions
-from hilctl_drivers.wired_dac import SerialDac, SerialOptions
 from tests.fakes import ShiftedClock, emulated, logged
 
 TIMEOUT_S = 1.0

@@ -5,7 +5,7 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl.experiment.devices import device_class
 from hilctl_drivers import endpoint
-from hilctl_drivers.board.board_dac import exchange_time
+from hilctl_drivers.board.board_session import exchange_time
 from hilctl_drivers.profile import load_profile
 
 WIRING = {"amplifier": {"gain_a_per_v": 1.0}, "sensor": {"um_per_v": 12.5}, "watchdog": "none"}

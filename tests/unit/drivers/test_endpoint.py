@@ -5,11 +5,11 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
+from hilctl_drivers.dac import SerialOptions
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.signal_chain import AddressOptions
 from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.tcp import TcpLink, TcpStream
-from hilctl_drivers.wired_dac import SerialOptions
 
 DCON = Path(__file__).parents[2] / "data" / "dcon_module.yaml"
 CHANNELS = {

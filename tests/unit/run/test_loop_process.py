@@ -316,7 +316,7 @@ OF_OTHERS = ("scipy.special", "mcap", "google.protobuf", "rich", "typer")
 
 @pytest.mark.slow
 @pytest.mark.parametrize(("modules", "left_out"), [
-    ("hilctl.run.loop_process, hilctl_drivers.modbus.modbus_dac", BULKY + OF_OTHERS),
+    ("hilctl.run.loop_process, hilctl_drivers.dac", BULKY + OF_OTHERS),
     ("hilctl.run.loop_process, hilctl_drivers.simulated.devices", BULKY + OF_OTHERS[1:]),
     ("hilctl.cli.run", BULKY),
     ("hilctl.run.control.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),

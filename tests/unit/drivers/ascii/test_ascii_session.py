@@ -11,7 +11,6 @@ from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
     FrameFormat,
     LineFormat,
-    TextReader,
     exchange_time,
     formats,
     parse_number,
@@ -107,16 +106,16 @@ def test_a_trip_is_asked_for(reply, tripped):
 
 
 def test_the_wrong_device_is_told_by_its_answer():
-    session(b"!027024\r", profile=PLAIN).check_selftest()
+    session(b"!027024\r", profile=PLAIN).identify()
     with pytest.raises(DeviceError, match="'!027024', got '!024017'"):
-        session(b"!024017\r").check_selftest()
+        session(b"!024017\r").identify()
 
 
 def test_another_end_of_line_names_its_key():
     for silent, keys in ((PLAIN, True), (load_profile("npoint_lc400"), False)):
         asked = session(None, profile=silent)
         with pytest.raises(links.NoAnswerError) as caught:
-            asked.check_selftest()
+            asked.identify()
         assert ("link.reply_terminator" in str(caught.value)) == keys
     for reply, line in ((b"OK\r\n", SCPI), (b"OK\r\n", LineFormat(b"\r"))):
         with pytest.raises(links.CorruptError, match="reply_terminator"):
@@ -209,11 +208,11 @@ class TestText:
 
 @pytest.mark.parametrize("name", ["kepco_bop", "tdk_lambda_gen"])
 def test_devices_without_a_strict_watchdog_cost_nothing(name):
-    assert TextReader.feed_time(load_profile(name)) is None
+    assert AsciiSession.feed_time(load_profile(name)) is None
 
 
 def test_an_unanswered_line_costs_its_characters():
-    time = TextReader.feed_time(load_profile("icp_m7024_dcon"))
+    time = AsciiSession.feed_time(load_profile("icp_m7024_dcon"))
     assert time.total_s == time.request_s == pytest.approx(len("~**\r") * 10 / 9600)
 
 

@@ -4,14 +4,6 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl_drivers.board.board_profile import FrameChannel
-from hilctl_drivers.profile import load_profile
-
-
-@pytest.mark.parametrize(
-    ("name", "driver"), [("cobs_board", "BoardSingle"), ("cobs_board_fifo", "BoardStream")]
-)
-def test_a_board_with_a_fifo_streams(name, driver):
-    assert load_profile(name).driver.endswith(f":{driver}")
 
 
 def test_range_is_inside_the_type():

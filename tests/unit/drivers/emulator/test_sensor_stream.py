@@ -4,7 +4,7 @@ import math
 
 import pytest
 
-from hilctl_drivers.sensor_stream.stream_reader import BlockParser
+from hilctl_drivers.sensor_stream.stream_session import BlockParser
 from tests.unit.drivers.emulator.conftest import MS, START_NS
 
 

@@ -7,9 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl_drivers.dac import ModbusDac, ModbusOptions
 from hilctl_drivers.emulator.factory import Emulator
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 from hilctl_drivers.profile import shipped_profiles
 from tests.fakes import FaultyLink, InProcess, ManualClock, emulated, logged
 

@@ -6,10 +6,9 @@ import struct
 import pytest
 
 from hilctl.base.errors import DeviceError
+from hilctl_drivers.dac import ModbusDac, ModbusOptions
 from hilctl_drivers.emulator.options import parse_fault
-from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 from hilctl_drivers.modbus.modbus_session import (
-    ModbusReader,
     ModbusSession,
     exchange_time,
 )
@@ -304,15 +303,15 @@ READ, WRITE = read_pdu(3, 101, 1), write_single_pdu(101, bytes(2))
     ("{kind: write, area: coil, address: 7, type: bit, value: 1}", requests_s(coil_pdu(7, True))),
 ])  # fmt: skip
 def test_each_kind_of_step_counts_with_all_that_it_may_send(feed, seconds):
-    assert ModbusReader.feed_time(acme(feed)).total_s == pytest.approx(seconds)
+    assert ModbusSession.feed_time(acme(feed)).total_s == pytest.approx(seconds)
 
 
 @pytest.mark.parametrize("name", ["labjack_t7", "wago_750", "adam_6024"])
 def test_watchdogs_that_exchanges_feed_cost_nothing(name):
-    assert ModbusReader.feed_time(load_profile(name)) is None
+    assert ModbusSession.feed_time(load_profile(name)) is None
 
 
-def test_modbus_dac_leaves_room_for_feeding(tmp_path):
+def test_register_wire_leaves_room_for_feeding(tmp_path):
     path = tmp_path / "acme.yaml"
     path.write_text(PROFILE.replace("FEED", FEED))
     options = {

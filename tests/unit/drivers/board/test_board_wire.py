@@ -14,7 +14,12 @@ from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
+<<<<<<< HEAD:tests/unit/drivers/board/test_board_dac.py
 from hilctl_drivers.board.board_dac import exchange_time
+=======
+from hilctl.loop.plan import LoopPlan
+from hilctl_drivers.board.board_session import exchange_time
+>>>>>>> 71b15354 (drivers: make a device of a wire, a watchdog and readers):tests/unit/drivers/board/test_board_wire.py
 from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.transport.framing import binary_framing
@@ -70,7 +75,7 @@ def test_the_board_keeps_the_pace(board):
     start = time.monotonic()
     hold(driven, 1.0, 10)
     assert time.monotonic() - start > 0.9 * 10 * BLOCK / RATE_HZ
-    assert driven.device.fifo_level_min > BLOCK  # a busy machine takes some for itself
+    assert driven.device._wire.fifo_level_min > BLOCK  # a busy machine takes some for itself
 
 
 def test_a_stall_of_this_machine_costs_fifo_and_no_sample(board):

@@ -9,13 +9,9 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError
+from hilctl_drivers.dac import ModbusStream, ModbusStreamOptions
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.labjack.modbus_stream import (
-    ModbusStream,
-    ModbusStreamOptions,
-    StreamSession,
-    stream_time,
-)
+from hilctl_drivers.labjack.labjack_wire import StreamSession, stream_time
 from hilctl_drivers.labjack.stream import VALUES_MAX
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
@@ -42,12 +38,7 @@ class DrivenStream:
         self.time = emulated.time
         self.link = emulated.link
         self._log = log
-        self.device = ModbusStream(
-            chosen,
-            link=emulated.link,
-            sleep=emulated.time.sleep,
-            clock=emulated.time,
-        )
+        self.device = emulated.stream(chosen)
         self.sent = 0
 
     def open(self, rate_hz=RATE_HZ, block=BLOCK):
@@ -143,7 +134,7 @@ def test_the_device_keeps_the_pace(driven):
     before = made.time()
     made.hold(1.0, 50)
     assert made.time() - before == pytest.approx(50 * BLOCK / RATE_HZ, rel=0.01)
-    assert made.device._stream.level_min > (FIFO_BLOCKS - 1.1) * BLOCK
+    assert made.device._wire.buffer.level_min > (FIFO_BLOCKS - 1.1) * BLOCK
     assert made.clock.underruns == 0
 
 
@@ -349,13 +340,13 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
     driven, monkeypatch, running, held_v, holds
 ):
     """Each alone is not: a running stream writes over the output with its next scan."""
-    device = driven().device
-    device._write = lambda data: None
-    encoded = device._setup.output.format.encode(held_v)
+    wire = driven().device._wire
+    wire._write = lambda data: None
+    encoded = wire.setup.output.format.encode(held_v)
     answer = [stream.u32(running), encoded]
-    monkeypatch.setattr(device._writer, "feedback", lambda *frames: answer)
+    monkeypatch.setattr(wire.session, "feedback", lambda *frames: answer)
     with nullcontext() if holds else pytest.raises(DeviceError):
-        device._confirm(1.0)
+        wire.confirm(1.0)
 
 
 @pytest.mark.parametrize(("changes", "text"), [

@@ -1,4 +1,4 @@
-"""``modbus_stream``: a DAC that plays blocks from the device's own buffer, over Modbus TCP.
+"""Wire to a LabJack that plays blocks from its own buffer, over Modbus TCP.
 
 In each scan of its own clock a LabJack T4 or T7 reads the input and then outputs one value
 (stream-out and stream-in in one scan list). That clock sets the pace. A block's displacements come
@@ -9,23 +9,23 @@ which is the longest stall of this machine. The first sample is output once that
 import math
 import time
 from collections.abc import Callable, Sequence
-from typing import ClassVar, cast
+from typing import Any, cast
 
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.device import DeviceOptions
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
+from hilctl_drivers.dac_setup import DacSetup
 from hilctl_drivers.device import check_fifo, check_next
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.stream import ENABLE, VALUES_MAX, InputCalibration, f32, u32
-from hilctl_drivers.modbus.modbus_device import ModbusDevice
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusInput, ModbusProfile
 from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import read_frame, write_frame
-from hilctl_drivers.signal_chain import DacOptions, FifoBlocks
-from hilctl_drivers.transport.links import Link, RefusedError
+from hilctl_drivers.modbus.register_wire import RegisterWire
+from hilctl_drivers.session import SensorReader
+from hilctl_drivers.transport.links import RefusedError
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 _RATE_TOLERANCE = 1e-4
@@ -56,8 +56,8 @@ class StreamSession:
         self._streaming = streaming
         self._timeout_s = timeout_s
         self._turnaround_s = turnaround_s
-        self._sleep = sleep
-        self._clock = clock
+        self.sleep = sleep
+        self.clock = clock
         self.capacity = 0
         """Values that the output's empty buffer holds."""
         self._parts: list[npt.NDArray[np.uint16]] = []
@@ -147,15 +147,15 @@ class StreamSession:
         """Return the next ``count`` scans, uint16[count * inputs]; wait for the device's clock."""
         count *= self._inputs
         rate_hz = self._rate_hz * self._inputs
-        deadline = self._clock() + count / rate_hz + self._timeout_s
+        deadline = self.clock() + count / rate_hz + self._timeout_s
         while self._waiting < count:
             # No more than one answer's worth, so that the last answer is not many.
             wanted = min(count - self._waiting, stream.SAMPLES_MAX)
             if wanted > self._backlog:
-                self._sleep((wanted - self._backlog) / rate_hz)
+                self.sleep((wanted - self._backlog) / rate_hz)
             self._exchange()
             # A device that still has readings is in time: the host has stalled.
-            if self._waiting < count and not self._backlog and self._clock() > deadline:
+            if self._waiting < count and not self._backlog and self.clock() > deadline:
                 late = f"{self._waiting} of {count} readings within {self._timeout_s:g} s"
                 raise DeviceError(f"the device's clock stands: {late} of when they were due")
         readings = np.concatenate(self._parts)
@@ -213,40 +213,18 @@ def stream_time(profile: ModbusProfile, block: int, inputs: int = 1) -> WireTime
     return WireTime(what, 0.0, 0.0, 0, 0.0, messages * profile.turnaround_s, block)
 
 
-class ModbusStreamOptions(DacOptions):
-    """Options of ``modbus_stream``."""
+class LabJackWire(RegisterWire):
+    """A :class:`~hilctl_drivers.modbus.register_wire.RegisterWire` that streams."""
 
-    fifo_blocks: FifoBlocks = 8
+    verb = "stream {output} and {input}"
 
-
-class ModbusStream(ModbusDevice):
-    """A :class:`~hilctl.base.device.Device` that streams over Modbus TCP."""
-
-    Options: ClassVar[type[DeviceOptions]] = ModbusStreamOptions
-
-    KIND = "modbus_stream"
-    ACTION = "stream {output} and {input}"
-
-    def __init__(
-        self,
-        options: ModbusStreamOptions,
-        link: Link | None = None,
-        sleep: Callable[[float], None] = time.sleep,
-        clock: Callable[[], float] = time.monotonic,
-    ) -> None:
-        super().__init__(options, link)
-        self._sleep, self._clock = sleep, clock
-        self._stream: StreamSession | None = None
-        self._calibrations: list[InputCalibration] = []
-        self._next_sample = 0
-
-    def _prepare(self) -> None:
-        super()._prepare()
-        options, profile = self._options, self._profile
+    def __init__(self, setup: DacSetup, link: Any) -> None:
+        super().__init__(setup, link)
+        options, profile = setup.options, self._profile
         streaming = profile.streaming
         if streaming == "none":
             raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
-        if self._setup.reads_elsewhere:
+        if setup.reads_elsewhere:
             raise InputError("reader must be omitted: input and output are in one scan list")
         for key in ("digital_output", "digital_input"):
             if getattr(options, key) is not None:
@@ -261,14 +239,21 @@ class ModbusStream(ModbusDevice):
                 rule = f"{what} must be one that {profile.title} can stream, {', '.join(known)}"
                 raise InputError(f"{rule}, got {name!r}")
         self._streaming = streaming
-        inputs = (self._setup.input, *(each.input for each in self._setup.aux))
+        inputs = (setup.input, *(each.input for each in setup.aux))
         self._sources = [profile.wire_address(cast(ModbusInput, each)) for each in inputs]
+        self._fifo_blocks: int = getattr(options, "fifo_blocks", 0)
         self.fifo_depth = streaming.fifo_depth
-        self.block_max = max(1, streaming.fifo_depth // (options.fifo_blocks + 1))
+        self.block_max = max(1, streaming.fifo_depth // (self._fifo_blocks + 1))
         rule = f"fifo_blocks + 1 of them must fit into the FIFO, {self.fifo_depth} samples"
         self.block_note = f": {rule}"
+        self.buffer = StreamSession(
+            self.session, streaming, options.reply_timeout_s, profile.turnaround_s
+        )
+        self._calibrations: list[InputCalibration] = []
+        self._next_sample = 0
 
-    def _rates(self, block: int) -> RateLimit:
+    def rates(self, block: int) -> RateLimit:
+        """See :meth:`~hilctl_drivers.wire.Wire.rates`."""
         streaming, settle_s = self._streaming, self._target.settle_s
         inputs, per_s = len(self._sources), streaming.samples_per_s_max
         most_hz, whose = streaming.rate_max_hz(inputs), f"{per_s:g} samples a second for"
@@ -278,70 +263,54 @@ class ModbusStream(ModbusDevice):
         wire = stream_time(self._profile, block, inputs)
         return RateLimit.of(wire, most_hz, whose, streaming.rate_min_hz)
 
-    def _open(self, sample_rate_hz: float, block: int) -> None:
-        """Self-test, init steps, calibration, buffers and clock; see :class:`DacDevice`.
+    def recover(self) -> None:
+        """End a trip, and a stream, also one of another program: it accepts no settings."""
+        super().recover()
+        self.buffer.stop()
 
-        The output does not move before enough blocks have come.
-        """
-        profile, streaming = self._profile, self._streaming
-        self._plan_feeding(sample_rate_hz / block)
-        self._connect()
-        writer = self._writer
-        self._end_trip()  # a device that has tripped refuses the steps that follow
-        stream = StreamSession(
-            writer,
-            streaming,
-            self._options.reply_timeout_s,
-            profile.turnaround_s,
-            self._sleep,
-            self._clock,
-        )
-        stream.stop()  # also one of another program: a running stream accepts no settings
-        writer.run(profile.init)
-        writer.run(streaming.setup)
-        self._calibrations = [stream.calibration(source // 2) for source in self._sources]
-        stream.prepare(sample_rate_hz, profile.wire_address(self._target), self._sources)
-        check_fifo(block, self._options.fifo_blocks, stream.capacity)
+    def start(self, reader: SensorReader, sample_rate_hz: float, block: int) -> None:
+        """Set calibration, buffers and clock; the output moves once enough blocks have come."""
+        buffer, profile = self.buffer, self._profile
+        self.session.run(self._streaming.setup)
+        self._calibrations = [buffer.calibration(source // 2) for source in self._sources]
+        buffer.prepare(sample_rate_hz, profile.wire_address(self._target), self._sources)
+        check_fifo(block, self._fifo_blocks, buffer.capacity)
         self._try_out_safe_value()
-        self._stream = stream
         self._next_sample = 0
-        self.transactions = stream_messages(block, len(self._sources))
+        self.requests = stream_messages(block, len(self._sources))
 
-    def _readers_of_aux(self) -> Sequence[Callable[[], float]]:
-        return ()  # they are in the scan list
-
-    def _exchange(
-        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
-    ) -> None:
+    def exchange(self, first_sample: int, command: F64, displacement_um: F64) -> None:
         """Queue a block and wait for the readings of the one that it pushes out."""
-        stream = self._stream
-        if stream is None:
-            raise DeviceError("not open")
+        chain = self.setup.chain
         check_next(first_sample, self._next_sample)
         # Queued before the readings are waited for: meanwhile the device must not run dry.
-        stream.feed(self._chain.output(command))
+        self.buffer.feed(chain.output(command))
         self._next_sample += command.size
-        readings = self._readings(stream, command.size)
-        if self._feed_every:
-            self._feed()
+        readings = self._readings(command.size)
         if readings is not None:
-            self._chain.fill_um(readings[0], displacement_um)
-            for k, source in enumerate(self._setup.aux):
+            chain.fill_um(readings[0], displacement_um)
+            for k, source in enumerate(self.setup.aux):
                 self.aux[k] = source.scaled(float(readings[k + 1].mean()))
 
-    def _readings(self, stream: StreamSession, block: int) -> list[F64] | None:
+    def _readings(self, block: int) -> list[F64] | None:
         """Return a block's volts of each input, float64[B]; None before the first one is due."""
-        kept = self._options.fifo_blocks * block
+        kept = self._fifo_blocks * block
         if self._next_sample < kept:
             return None
         if self._next_sample == kept:
-            stream.start()
+            self.buffer.start()
             return None
-        scans = stream.take(block).reshape(block, -1)
+        scans = self.buffer.take(block).reshape(block, -1)
         return [each.volts(scans[:, k]) for k, each in enumerate(self._calibrations)]
 
+    def close(self) -> None:
+        """See :meth:`~hilctl_drivers.wire.Wire.close`."""
+        # The stream first: an output that moves must not be without its watchdog.
+        self.buffer.stop()
+        super().close()
+
     def _write(self, data: bytes) -> None:
-        feedback = self._writer.feedback
+        feedback = self.session.feedback
         write = write_frame(self._profile.wire_address(self._target), data)
         # The stream first: it would write over the safe value with its next scan.
         try:
@@ -352,17 +321,7 @@ class ModbusStream(ModbusDevice):
     def _read_back(self) -> float:
         output = self._target
         target = read_frame(self._profile.wire_address(output), output.words)
-        running, held = self._writer.feedback(read_frame(ENABLE, 2), target)
+        running, held = self.session.feedback(read_frame(ENABLE, 2), target)
         if running != u32(0):
             raise DeviceError("the stream was stopped, but still runs")
         return output.format.decode(held)
-
-    def _close(self) -> None:
-        # The stream first: an output that moves must not be without its watchdog.
-        if self._stream is not None:
-            self._stream.stop()
-        super()._close()
-
-    def _release(self) -> None:
-        self._stream = None
-        super()._release()

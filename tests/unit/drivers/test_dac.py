@@ -11,8 +11,8 @@ import yaml
 
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.yaml import dump
+from hilctl_drivers.dac import SerialDac, SerialOptions
 from hilctl_drivers.profile import shipped_profiles
-from hilctl_drivers.wired_dac import SerialDac, SerialOptions
 from tests.fakes import made_safe
 from tests.unit.drivers.conftest import TIMEOUT_S
 
@@ -219,7 +219,7 @@ def test_the_output_is_measured_where_that_is_asked_for(rig, profile, current_a)
     bench = rig(profile, reader="agilent_34970a", own_line=True, measure="current")
     info = bench.device.info
     assert (quick.measures_command, info.measures_command) == (False, True)
-    assert "to measure current" in info.rate_note
+    assert "to measure" in info.rate_note
     assert info.max_rate_hz < quick.max_rate_hz
     bench.device.open(10.0, 1)
     displacement_um, measured = np.full(1, np.nan), np.full(1, np.nan)
@@ -312,7 +312,7 @@ def test_a_line_that_never_falls_silent_gets_the_safe_value(rig, kind):
     bench = rig(kind, timeout_s=SILENCE_S)
     bench.open()
     bench.exchange(2.0)
-    link = bench.device._link
+    link = bench.device._wire.link
     # As where somebody keeps sending: the line is never found quiet.
     link._stale = True
 

@@ -9,8 +9,8 @@ import pytest
 from pydantic import ValidationError
 
 from hilctl.base.errors import DeviceError, InputError
+from hilctl_drivers.dac import ModbusDac, ModbusOptions
 from hilctl_drivers.emulator.options import parse_fault
-from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 from tests.fakes import T7_OPTIONS, made_safe
 from tests.unit.drivers.modbus.conftest import exchange
 
@@ -122,7 +122,7 @@ class TestExchange:
     def test_one_transaction_is_found_out_without_moving(self, serve, profile, without, one):
         served = serve(profile, **without)
         device = served.running(10.0, timeout_s=0.5)
-        assert device.one_transaction is one
+        assert (device.transactions == 1) is one
         assert {event["current_a"] for event in served.events()} <= {0.0}
         exchange(device, 3.0)
         served.clock.pass_s(0.1)
@@ -170,7 +170,7 @@ class TestExchange:
         served = serve("labjack_t7", output="TDAC0")
         device = served.running(333.0)
         assert device.info.max_rate_hz == pytest.approx(1e3 / 3)  # 1 ms each and 1 ms to settle
-        assert not device.one_transaction
+        assert device.transactions == 2
         assert served.events() == []
         exchange(device, 1.0)
         device.close()

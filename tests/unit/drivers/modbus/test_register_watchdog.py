@@ -5,8 +5,8 @@ import socket
 import pytest
 
 from hilctl.base.errors import DeviceError
+from hilctl_drivers.dac import ModbusDac, ModbusOptions
 from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.modbus.modbus_dac import ModbusDac, ModbusOptions
 from tests.fakes import emulated, made_safe
 from tests.unit.drivers.modbus.conftest import MESSAGE_S, RATE_HZ, exchange
 from tests.unit.drivers.modbus.conftest import TIMEOUT_S as ANSWER_S
@@ -224,13 +224,14 @@ def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
     made.link.late_s = late_s
     with pytest.raises(DeviceError, match="no answer"):
         made.exchange(4.0)
-    write = made.device._write
+    wire = made.device._wire
+    write = wire._write
 
     def written_over(data):
         write(data)
         made.time.sleep(late_s)
 
-    made.device._write = written_over
+    wire._write = written_over
     with pytest.raises(DeviceError, match=r"0 V .*but 4"):
         made.device.make_safe(0.0)
     made.device.make_safe(0.0)
@@ -240,15 +241,15 @@ def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
 def test_a_step_of_the_output_is_no_other_value(driven):
     """Which of two neighbours a device rounds to is its own affair; floats round to a millionth."""
     for profile in ("adam_6024", "generic_float32"):
-        device = driven(profile).device
-        output = device._setup.output
+        wire = driven(profile).device._wire
+        output = wire.setup.output
         step = output.step or 1e-6 * (output.max - output.min)
         assert step > 0.0
-        device._write = lambda data: None
-        device._held = lambda found=step: found
-        device._confirm(0.0)
+        wire._write = lambda data: None
+        wire.read = lambda found=step: found
+        wire.confirm(0.0)
         with pytest.raises(DeviceError):
-            device._confirm(-0.01 * step)
+            wire.confirm(-0.01 * step)
 
 
 def test_no_name_is_looked_up_for_it(monkeypatch):

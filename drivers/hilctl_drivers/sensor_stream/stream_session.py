@@ -1,14 +1,14 @@
-"""Reader of the newest sample of a sensor that sends unasked."""
+"""Session that reads the newest sample of a sensor that sends unasked."""
 
 import math
 import time
 from collections.abc import Callable
 from typing import cast
 
-from hilctl_drivers.dac_setup import DacSetup, SensorReader
 from hilctl_drivers.endpoint import Endpoint
 from hilctl_drivers.sensor_stream.stream_profile import HeaderField, StreamInput, StreamProfile
-from hilctl_drivers.transport.links import CorruptError, Link, NoAnswerError
+from hilctl_drivers.session import Session
+from hilctl_drivers.transport.links import CorruptError, NoAnswerError
 from hilctl_drivers.transport.tcp import TcpReceiver
 from hilctl_drivers.transport.wire_time import WireTime
 
@@ -96,41 +96,47 @@ def _number(field: HeaderField | int) -> Callable[[bytearray], int]:
     return lambda head: int(decode(head[at:end]))
 
 
-class StreamReader(SensorReader):
-    """A :class:`~hilctl_drivers.dac_setup.SensorReader` that takes the newest sample."""
+class SensorStreamSession(Session):
+    """A :class:`~hilctl_drivers.session.Session` that takes the newest sample."""
 
     AGES = True
     READS_ANY = False
 
-    def __init__(self, setup: DacSetup, link: Link) -> None:
-        super().__init__(setup, link)
-        self._profile = cast(StreamProfile, setup.reader.profile)
-        self._source = cast(StreamInput, setup.input)
-        self._receiver: TcpReceiver = self._own
-        self._wait_s = setup.reader.timeout_s
-        self._parser = BlockParser(self._profile, self._source)
+    def __init__(self, profile: StreamProfile, receiver: TcpReceiver, wait_s: float) -> None:
+        self._profile = profile
+        self._receiver = receiver
+        self._wait_s = wait_s
         self._arrived_ns = 0
 
+    @classmethod
+    def on(cls, device: Endpoint, link: TcpReceiver) -> "SensorStreamSession":
+        """See :meth:`~hilctl_drivers.session.Session.on`."""
+        return cls(cast(StreamProfile, device.profile), link, device.timeout_s)
+
     @staticmethod
-    def time(profile: StreamProfile, source: StreamInput) -> WireTime:
-        """See :meth:`~hilctl_drivers.dac_setup.SensorReader.time`."""
+    def new_link(device: Endpoint) -> TcpReceiver:
+        """See :meth:`~hilctl_drivers.session.Session.new_link`."""
+        return TcpReceiver(device.host, int(device.port), device.timeout_s)
+
+    @staticmethod
+    def read_time(profile: StreamProfile, source: StreamInput) -> WireTime:
+        """See :meth:`~hilctl_drivers.session.Session.read_time`."""
         what = f"newest sample of {profile.title}, at most {1e3 * profile.link.max_age_s:g} ms old"
         return WireTime(what, 0.0, 0.0, 0, 0.0, profile.turnaround_s, settle_s=source.settle_s)
 
-    @property
-    def lost(self) -> int:
-        """See :attr:`~hilctl_drivers.dac_setup.SensorReader.lost`."""
-        return self._parser.lost
+    def input_reader(self, source: StreamInput) -> Callable[[], float]:
+        """See :meth:`~hilctl_drivers.session.Session.input_reader`; the last one is read."""
+        self._source = source
+        self._parser = BlockParser(self._profile, source)
+        return self._newest
 
     def start(self) -> None:
-        """See :meth:`~hilctl_drivers.dac_setup.SensorReader.start`."""
+        """See :meth:`~hilctl_drivers.session.Session.start`."""
         self._take()
-        self._parser.lost = 0
+        self.lost = self._parser.lost = 0
 
-    def _new_link(self, reader: Endpoint) -> TcpReceiver:
-        return TcpReceiver(reader.host, int(reader.port), reader.timeout_s)
-
-    def _identify(self) -> None:
+    def identify(self) -> None:
+        """Wait for a block; raise DeviceError if none comes."""
         self._parser = BlockParser(self._profile, self._source)
         deadline = time.monotonic() + self._wait_s
         while not self._parser.values:
@@ -143,8 +149,9 @@ class StreamReader(SensorReader):
         data, age_ns = self._receiver.receive()
         if data and self._parser.feed(data):
             self._arrived_ns = time.monotonic_ns() - age_ns
+        self.lost = self._parser.lost
 
-    def _read(self) -> float:
+    def _newest(self) -> float:
         self._take()
         if not self._parser.values:
             return math.nan

@@ -6,10 +6,10 @@ import struct
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError
+from hilctl_drivers.dac import SerialDac, SerialOptions
 from hilctl_drivers.profile import load_profile
-from hilctl_drivers.sensor_stream.stream_reader import BlockParser
+from hilctl_drivers.sensor_stream.stream_session import BlockParser
 from hilctl_drivers.transport.links import CorruptError
-from hilctl_drivers.wired_dac import SerialDac, SerialOptions
 from tests.unit.drivers.conftest import TIMEOUT_S
 
 PROFILE = load_profile("capancdt_6200")

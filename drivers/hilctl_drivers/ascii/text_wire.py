@@ -1,0 +1,256 @@
+"""Wire to devices with a text protocol or fixed frames.
+
+A sample is one request and its reply, or two if writing and reading are separate.
+"""
+
+import re
+from collections.abc import Callable
+from functools import partial
+from string import Formatter
+from typing import cast
+
+from hilctl.base.errors import UnconfirmedError
+from hilctl.base.types import F64
+from hilctl_drivers.ascii.ascii_profile import (
+    AsciiExchange,
+    AsciiOutput,
+    Readback,
+    binary_format,
+    fill,
+)
+from hilctl_drivers.ascii.ascii_session import (
+    AsciiSession,
+    exchange_time,
+    parse_number,
+    query_time,
+    reading,
+)
+from hilctl_drivers.dac_setup import DacSetup
+from hilctl_drivers.session import SensorReader
+from hilctl_drivers.transport.links import Link, WatchdogTrippedError
+from hilctl_drivers.transport.safe_exchange import check_read_back, try_out
+from hilctl_drivers.transport.wire_time import RateLimit, WireTime
+from hilctl_drivers.wire import HostWatchdog, Wire
+
+_NO_EVIDENCE = (
+    "the device cannot confirm it: it does not answer, or repeats what it is sent, and its profile "
+    "has neither readback nor error_query"
+)
+
+
+class TextWatchdog(HostWatchdog):
+    """A watchdog that lines set; ``write`` and ``confirm`` set the output."""
+
+    def __init__(
+        self,
+        setup: DacSetup,
+        session: AsciiSession,
+        write: Callable[[float], object],
+        confirm: Callable[[float], None],
+    ) -> None:
+        self._session, self._write, self._confirm = session, write, confirm
+        self._options = options = setup.options
+        self._has = session.profile.watchdog
+        self._safe = setup.chain.output(options.safe_command)
+        self._safe_number = cast(AsciiOutput, setup.output).number(self._safe)
+        self.arm_s = session.arm_s(session.profile, options.output)
+
+    def arm(self) -> None:
+        """See :meth:`~hilctl_drivers.wire.HostWatchdog.arm`."""
+        self._run("arming")
+
+    def disarm(self) -> None:
+        """See :meth:`~hilctl_drivers.wire.HostWatchdog.disarm`."""
+        self._run("disarm")
+
+    def feed(self) -> None:
+        """See :meth:`~hilctl_drivers.wire.HostWatchdog.feed`."""
+        self._run("feed")
+
+    def clear(self) -> None:
+        """Clear a trip."""
+        self._run("clear")
+
+    def tripped(self) -> bool:
+        """See :meth:`~hilctl_drivers.wire.HostWatchdog.tripped`."""
+        return self._session.tripped()
+
+    def recover(self) -> None:
+        """End a trip of an earlier run, at the safe value."""
+        if self._has == "none" or not self.tripped():
+            return
+        # Before if it is accepted, and after in any case: a device that goes back to its last
+        # command when the trip ends must not output that, or not for longer than one line takes.
+        if not self._has.refuses_while_tripped:
+            self._write(self._safe)
+        self.clear()
+        self._confirm(self._safe)
+
+    def _run(self, name: str) -> None:
+        has, options = self._has, self._options
+        assert has != "none"
+        steps = has.arming(options.output) if name == "arming" else getattr(has, name)
+        counts = has.counts(options.watchdog_timeout_s or has.min_s)
+        self._session.run(steps, timeout=counts, safe=self._safe_number)
+
+
+class TextWire(Wire):
+    """A :class:`~hilctl_drivers.wire.Wire` with lines of text or fixed frames."""
+
+    session: AsciiSession
+
+    def __init__(self, setup: DacSetup, link: Link) -> None:
+        super().__init__(setup, link)
+        self.session = AsciiSession.on(setup.writer, link)
+        self._profile = profile = self.session.profile
+        self._target = target = cast(AsciiOutput, setup.output)
+        self.watchdog: TextWatchdog = TextWatchdog(setup, self.session, self._write, self.confirm)
+        options, combined = setup.options, profile.exchange
+        own = None if setup.reads_elsewhere else (options.output, options.input)
+        self._combined: AsciiExchange | None = None
+        if combined != "none" and (combined.output, combined.input) == own:
+            self._combined = combined
+        readback, watchdog = target.readback, profile.watchdog
+        self._readback: Readback | None = None
+        # An undetectable trip may have changed the output since the last command.
+        blind = watchdog != "none" and watchdog.tripped == "none"
+        if readback != "none" and not (blind and readback.of == "command"):
+            self._readback = readback
+        self.reads_output = self._readback is not None
+        # Half duplex: what was asked last is answered before the safe value can go out.
+        write = exchange_time(profile, options.output, None)
+        busy = self._own_time()
+        if setup.shares_link or setup.aux or setup.digital_output:
+            busy = setup.after_reading(busy)
+        self.longest_message_s = busy.answered_s + write.answered_s
+        self.unconfirmed = self._unconfirmed()
+
+    def rates(self, block: int) -> RateLimit:
+        """See :meth:`~hilctl_drivers.wire.Wire.rates`."""
+        return self.setup.rates(self.setup.after_reading(self._own_time()))
+
+    def _own_time(self) -> WireTime:
+        """Return the time of a sample without another device that reads the sensor."""
+        setup, profile = self.setup, self._profile
+        options = setup.options
+        own = None if setup.reads_elsewhere else options.input
+        wire = exchange_time(profile, options.output, own)
+        if setup.measure is not None:
+            wire = wire.then(query_time(profile, setup.measure).named("to measure the output"))
+        return wire.then(setup.feed_time)
+
+    def start(self, reader: SensorReader, sample_rate_hz: float, block: int) -> None:
+        """See :meth:`~hilctl_drivers.wire.Wire.start`."""
+        self._reader = reader
+        self._try_out_safe_value()
+        self.requests = (2 if self._combined is None else 1) + (self.setup.measure is not None)
+
+    def exchange(self, first_sample: int, command: F64, displacement_um: F64) -> None:
+        """See :meth:`~hilctl_drivers.wire.Wire.exchange`."""
+        chain, combined = self.setup.chain, self._combined
+        value = chain.output(command.item())
+        if combined is not None:
+            text = self.session.text(combined.write, value=self._target.number(value))
+            number = reading(combined, partial(self.session.ask, text))
+            found = self._profile.inputs[combined.input].value(number)
+        else:
+            # First the reading, which must not show yet what the command does.
+            found = self._reader.read()
+            self._write(value)
+        displacement_um[0] = chain.displacement_um(found)
+
+    def read(self) -> float | None:
+        """See :meth:`~hilctl_drivers.wire.Wire.read`."""
+        if self._readback is None:
+            return None
+        return self._target.value(self.session.number(self._readback))
+
+    def look(self, reader: SensorReader) -> tuple[float, float | None]:
+        """See :meth:`~hilctl_drivers.wire.Wire.look`."""
+        found, output = reader.read(), self._measured_output()
+        # A wrong query must show here: a run asks these last.
+        if self._target.readback != "none":
+            self.session.number(self._target.readback)
+        self.session.check_errors()
+        return found, output
+
+    def _measured_output(self) -> float | None:
+        """Return the output as the device measures it, or as it says that it is, tripped or not."""
+        unit = self._target.unit
+        for source in self._profile.inputs.values():
+            if source.measures == "output" and source.unit == unit:
+                return self.session.value(source)
+        readback = self._target.readback
+        if readback != "none" and readback.of == "command" and self.watchdog.tripped():
+            return None
+        return self.read()
+
+    def _write(self, value: float) -> bool:
+        """Write the output; return whether the answer shows that a device has received it."""
+        text, reply = self._command(value), self._target.reply
+        if reply == "none":
+            self.session.send(text)
+            return False
+        # A line that echoes gives an answer that equals what was sent.
+        return self.session.ask(text, reply).string != text
+
+    def _command(self, value: float) -> str:
+        return self.session.text(self._target.write, value=self._target.number(value))
+
+    def message(self, value: float) -> bytes:
+        """See :meth:`~hilctl_drivers.wire.Wire.message`."""
+        return self.session.line(self._command(value))
+
+    def confirm(self, value: float) -> None:
+        """See :meth:`~hilctl_drivers.wire.Wire.confirm`."""
+        try:
+            answered = self._write(value)
+        except WatchdogTrippedError:
+            self.watchdog.clear()
+            answered = self._write(value)
+        # A command without a reply may have been ignored.
+        output, readback = self._target, self._target.readback
+        if readback != "none":
+            found = output.value(self.session.number(readback))
+            check_read_back(output, value, found, 2.0 * output.step)
+        elif self._profile.error_query != "none":
+            if self.session.old_errors():  # of this value, or of an older command
+                self._write(value)
+                self.session.check_errors()
+        elif not answered:
+            raise UnconfirmedError(f"the value was sent, but {_NO_EVIDENCE}")
+
+    def _try_out_safe_value(self) -> None:
+        """Set the output to what it holds, with the command of the safe value; nothing moves.
+
+        An output that cannot be read is left alone, and so is a value that the command would round.
+        """
+        value = self.read()
+        if value is None:
+            return
+        fields = Formatter().parse(self._target.write)
+        spec = next(spec or "" for _, field, spec, _ in fields if field == "value")
+        sent = fill(f"{{value:{spec}}}", value=self._target.number(value))
+        if self._target.value(parse_number(sent, binary_format(spec))) != value:
+            return
+
+        def put() -> None:
+            self._write(value)
+            self.session.check_errors()
+
+        try_out(self._target, value, put, f"with {self._command(value)}")
+
+    def _unconfirmed(self) -> str:
+        """Return why a value cannot be confirmed; empty if it can."""
+        reply = self._target.reply
+        if self._target.readback != "none" or self._profile.error_query != "none":
+            return ""
+        if reply == "none" or _without_numbers(reply.example) == _without_numbers(
+            self._command(self._target.min)
+        ):
+            return _NO_EVIDENCE
+        return ""
+
+
+def _without_numbers(text: str) -> str:
+    return re.sub(r"[-+.\d]+", "#", text)

@@ -1,0 +1,269 @@
+"""``Dac``: a device with an output, described by a profile; kinds differ in their options only.
+
+A tick is one exchange on the wire, and up to three further requests: to measure the output, for an
+auxiliary channel, and to feed a strict watchdog. No request is sent before the last reply has come,
+and a serial line is drained after a timeout.
+"""
+
+from collections.abc import Callable, Sequence
+from dataclasses import replace
+from pkgutil import resolve_name
+from typing import ClassVar
+
+from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.errors import InputError
+from hilctl.base.types import F64
+from hilctl_drivers.dac_setup import DacSetup
+from hilctl_drivers.device import DacDevice
+from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, Measure
+from hilctl_drivers.transport.links import Link
+from hilctl_drivers.transport.safe_exchange import SafeExchange
+from hilctl_drivers.transport.serial_port import SerialLink
+from hilctl_drivers.transport.stream_link import StreamLink
+from hilctl_drivers.transport.wire_time import RateLimit, check_feeds
+from hilctl_drivers.wire import Wire
+
+_PROMPT_S = 0.2
+"""A longer delay of the safe value is mentioned in ``safe_note``."""
+
+
+class Dac(DacDevice):
+    """A :class:`~hilctl.base.device.Device` with a profile.
+
+    It is made of a wire to the output and its watchdog (:mod:`hilctl_drivers.wire`), the scale of
+    amplifier and sensor (:class:`~hilctl_drivers.signal_chain.SignalChain`), and readers of the
+    sensor, of the output, and of auxiliary channels.
+
+    Args:
+        options: Options of its kind.
+        link: Link to the device with the output; a new one by default.
+
+    Raises:
+        InputError: The profile cannot be used, or the options do not fit it.
+    """
+
+    KIND: ClassVar[str]  # its kind in experiments
+
+    def __init__(self, options: DacOptions, link: Link | None = None) -> None:
+        named = options.profile
+        if (path := named.profile.WIRES.get(self.KIND)) is None:
+            kind = named.profile.DEVICE
+            raise InputError(f"profile {named.name} is one for kind: {kind}, not {self.KIND}")
+        self._options = options
+        self._setup = setup = DacSetup.of(options)
+        self._chain = setup.chain
+        self._wire: Wire = resolve_name(path)(setup, link or setup.writer.link())
+        self._reader = setup.reader_on(self._wire.link)
+        self._measure: Callable[[], float] | None = None
+        if setup.measure is not None:
+            self._measure = self._wire.session.input_reader(setup.measure)
+            self._measured_by = setup.chain.measured(setup.measure)
+        self._safe_exchange = SafeExchange()
+        self._feed_every = self._ticks = 0
+        self.block_max, self.block_note = self._wire.block_max, self._wire.block_note
+        title = f"{self.KIND} {setup.writer.name} at {setup.writer.place}"
+        action = self._wire.verb.format(output=options.output, input=options.input)
+        super().__init__(self._describe(), title, action, options.output)
+        self.aux = self._wire.aux
+
+    def _describe(self) -> DeviceInfo:
+        options, wire = self._options, self._wire
+        details, late_blocks = {}, 0
+        if wire.fifo_depth:
+            late_blocks = getattr(options, "fifo_blocks", 0)
+            details["fifo_depth"] = f"{wire.fifo_depth} samples"
+            details["fifo_level"] = f"{late_blocks} blocks"
+        return self._setup.info(
+            self.KIND,
+            wire.rates(wire.block_max),
+            buffered=wire.fifo_depth > 0,
+            fifo_depth=wire.fifo_depth,
+            latency_blocks=late_blocks,
+            measures_command=self._measure is not None,
+            reads_output=wire.reads_output,
+            arm_s=0.0 if options.watchdog == "none" else wire.watchdog.arm_s,
+            safe_note="; ".join(filter(None, (self._late_note(), wire.unconfirmed))),
+            confirms=not wire.unconfirmed,
+            details=details,
+        )
+
+    def _late_note(self) -> str:
+        message_s = self._wire.longest_message_s
+        if message_s <= _PROMPT_S:
+            return ""
+        timeout_s = self._options.watchdog_timeout_s
+        behind = "no watchdog of the device stands behind it"
+        if timeout_s is not None:
+            behind = f"the device's watchdog acts after {timeout_s:g} s"
+        return f"a message takes up to {message_s:.2g} s on this line; {behind}"
+
+    @property
+    def port_identity(self) -> str:
+        """See :class:`hilctl.base.device.PortDevice`; empty on TCP."""
+        link = self._wire.link
+        return link.identity.known if isinstance(link, SerialLink) else ""
+
+    @port_identity.setter
+    def port_identity(self, known: str) -> None:
+        if isinstance(self._wire.link, SerialLink):
+            self._wire.link.identity.known = known
+
+    @property
+    def reading_age_s(self) -> float:
+        """See :attr:`hilctl.base.device.AgingDevice.reading_age_s`."""
+        return self._reader.session.age_s
+
+    @property
+    def lost_readings(self) -> int:
+        """See :attr:`hilctl.base.device.AgingDevice.lost_readings`."""
+        return self._reader.session.lost
+
+    def _rates(self, block: int) -> RateLimit:
+        return self._wire.rates(block)
+
+    def _check_block(self, block: int) -> None:
+        super()._check_block(block)
+        self._wire.check_block(block)
+
+    def _open(self, sample_rate_hz: float, block: int) -> None:
+        """Connect, end what an earlier run has left, init steps, one reading, test of the output.
+
+        The order matters: a device that has tripped refuses steps, and a wrong input must show
+        before the output can move.
+        """
+        wire = self._wire
+        self._plan_feeding(sample_rate_hz / block)
+        self._connect(block / sample_rate_hz if wire.fifo_depth else 0.0)
+        wire.recover()
+        wire.session.set_up()
+        self._reader.begin()
+        wire.start(self._reader, sample_rate_hz, block)
+        wire.session.check_errors()
+        self.transactions = wire.requests
+
+    def _plan_feeding(self, ticks_per_s: float) -> None:
+        """Take the rate of exchanges, or raise DeviceError if it is too low for the watchdog."""
+        has = self._setup.writer.profile.watchdog
+        ticks = check_feeds(self._options.watchdog_timeout_s, ticks_per_s)
+        self._feed_every = ticks if has != "none" and has.kick == "strict" else 0
+        self._ticks = 0
+
+    def _connect(self, block_s: float = 0.0) -> None:
+        """Connect, check that the devices are the right ones, and note errors of before."""
+        if errors := self._wire.open(block_s):
+            details = {**self._info.details, "earlier_errors": "; ".join(errors)}
+            self._info = replace(self._info, details=details)
+        self._reader.open()
+
+    def _arm(self) -> None:
+        if self._options.watchdog != "none":
+            self._wire.watchdog.arm()
+            self._wire.session.check_errors()
+        self._reader.session.start()
+
+    def _exchange(
+        self, first_sample: int, command: F64, displacement_um: F64, measured: F64
+    ) -> None:
+        self._wire.exchange(first_sample, command, displacement_um)
+        if self._measure is not None:
+            self._measure_output(measured)
+        if self._feed_every:
+            self._ticks += 1
+            if self._ticks % self._feed_every == 0:
+                self._wire.watchdog.feed()
+
+    def _measure_output(self, measured: F64) -> None:
+        if self._measure is not None:
+            gain, offset = self._measured_by
+            measured[0] = self._measure() * gain + offset
+
+    def _readers_of_aux(self) -> Sequence[Callable[[], float]]:
+        if self._wire.fifo_depth:
+            return ()  # the wire reads them with each block
+        return self._setup.aux_readers(self._wire.link, self._reader.link)
+
+    def _output(self) -> float | None:
+        held = self._wire.read()
+        return None if held is None else self._chain.command(held)
+
+    def _look(self) -> tuple[float, float | None]:
+        self._connect()
+        reading, held = self._wire.look(self._reader)
+        command = None if held is None else self._chain.command(held)
+        return self._chain.displacement_um(reading), command
+
+    def _tripped(self) -> bool:
+        return self._wire.watchdog.tripped()
+
+    def _set_digital(self, high: bool) -> None:
+        self._wire.session.set_digital(self._setup.digital_output, high=high)
+
+    def _read_digital(self) -> bool:
+        return self._wire.session.is_high(self._setup.digital_input)
+
+    def _abandon(self) -> None:
+        """Keep a serial port: opening it again could reset a board before its output is safe.
+
+        The reader is kept too: the safe value must not wait until its port is closed.
+        """
+        self._wire.link.doubt()
+
+    def _put_out(self, command: float) -> None:
+        # No self-test, no init steps, no reader: none of them may cost the safe value.
+        value, wire, link = self._chain.output(command), self._wire, self._wire.link
+        if isinstance(link, StreamLink):
+            self._safe_exchange.attempt(
+                link, lambda: link.send_now(wire.message(value)), lambda: wire.confirm(value)
+            )
+        else:
+            link.open()  # a new connection: no answer to an older command can come on it
+            wire.confirm(value)
+
+    def _close(self) -> None:
+        self._wire.close()
+        self._reader.end()
+        self._wire.session.check_errors()
+
+    def _release(self) -> None:
+        self._wire.release()
+        self._reader.release()
+
+
+class SerialOptions(DacOptions):
+    """Options of ``serial_dac``."""
+
+    measure: Measure = None
+    fifo_blocks: FifoBlocks = 8
+
+
+class SerialDac(Dac):
+    """Text, fixed bytes or frames, on a serial line or a TCP stream."""
+
+    Options: ClassVar[type[DeviceOptions]] = SerialOptions
+    KIND = "serial_dac"
+
+
+class ModbusOptions(DacOptions):
+    """Options of ``modbus_dac``."""
+
+    measure: Measure = None
+
+
+class ModbusDac(Dac):
+    """Registers on Modbus TCP or RTU."""
+
+    Options: ClassVar[type[DeviceOptions]] = ModbusOptions
+    KIND = "modbus_dac"
+
+
+class ModbusStreamOptions(DacOptions):
+    """Options of ``modbus_stream``."""
+
+    fifo_blocks: FifoBlocks = 8
+
+
+class ModbusStream(Dac):
+    """Blocks through the buffer of a LabJack, on its clock."""
+
+    Options: ClassVar[type[DeviceOptions]] = ModbusStreamOptions
+    KIND = "modbus_stream"

@@ -1,0 +1,135 @@
+"""What a :class:`~hilctl_drivers.dac.Dac` is made of for its protocol: the wire, and the watchdog.
+
+Values are in the unit of the output or input, commands in that of the actuator. Errors are
+``DeviceError`` and name neither the device nor the action: the device adds them.
+"""
+
+from abc import ABC, abstractmethod
+from typing import Any
+
+import numpy as np
+
+from hilctl.base.types import F64
+from hilctl_drivers.dac_setup import DacSetup
+from hilctl_drivers.session import SensorReader, Session
+from hilctl_drivers.transport.wire_time import RateLimit
+
+
+class HostWatchdog(ABC):
+    """The device's own watchdog, as the experiment wants it."""
+
+    arm_s = 0.0
+    """Longest time to arm it."""
+
+    @abstractmethod
+    def recover(self) -> None:
+        """End a trip of an earlier run, after which the device accepts its init steps."""
+
+    @abstractmethod
+    def arm(self) -> None:
+        """Arm it; called only if the experiment wants it."""
+
+    @abstractmethod
+    def disarm(self) -> None:
+        """Disarm it; called only if the experiment wants it."""
+
+    def feed(self) -> None:  # noqa: B027  most watchdogs are fed by each exchange
+        """Feed a watchdog that exchanges do not feed."""
+
+    @abstractmethod
+    def tripped(self) -> bool:
+        """Return whether it has tripped; False if it cannot be known."""
+
+
+class Wire(ABC):
+    """The way to the output of a device: each protocol has one, a device that streams another.
+
+    It describes itself in attributes and opens nothing before :meth:`open`.
+
+    Args:
+        setup: The options and profiles; raise InputError for an option that is not supported.
+        link: The link to the device with the output.
+    """
+
+    session: Session
+    watchdog: HostWatchdog
+    block_max = 1  # samples of one exchange
+    block_note = ""  # reason for that limit, in messages
+    fifo_depth = 0  # samples; 0 if a sample is exchanged per message, at the host's pace
+    verb = "write {output}, read {input}"  # an exchange in messages
+    reads_output = True  # whether the output can be read before a run
+    unconfirmed = ""  # why a written value cannot be confirmed; empty if it can
+    longest_message_s = 0.0  # longest delay of the safe value by a running exchange
+    requests = 1  # requests of an exchange, known after :meth:`start`
+
+    def __init__(self, setup: DacSetup, link: Any) -> None:
+        self.setup = setup
+        self.link = link
+        self.aux: F64 = np.full(len(setup.aux), np.nan)
+        """Newest values of the auxiliary channels."""
+
+    @abstractmethod
+    def rates(self, block: int) -> RateLimit:
+        """Return the sample rates that it can keep with this block."""
+
+    def check_block(self, block: int) -> None:  # noqa: B027
+        """Raise DeviceError for a block within ``block_max`` that it does not support."""
+
+    def open(self, block_s: float = 0.0) -> list[str]:
+        """Connect, identify the device, and return errors of earlier sessions.
+
+        An answer may take ``block_s`` longer than the timeout, if the device's clock sets the pace.
+        """
+        self.link.open()
+        self.session.identify()
+        return self.session.old_errors()
+
+    def recover(self) -> None:
+        """End what an earlier run has left, after which the device accepts its init steps."""
+        self.watchdog.recover()
+
+    @abstractmethod
+    def start(self, reader: SensorReader, sample_rate_hz: float, block: int) -> None:
+        """Prepare the exchange, and test the message of the safe value; nothing moves.
+
+        ``reader`` reads the sensor in each exchange, unless the reply brings the reading.
+        """
+
+    @abstractmethod
+    def exchange(self, first_sample: int, command: F64, displacement_um: F64) -> None:
+        """Send a block and fill in the displacements; with a FIFO, :attr:`aux` too.
+
+        Sizes and range are good, see :meth:`hilctl.base.device.Device.exchange`.
+        """
+
+    @abstractmethod
+    def read(self) -> float | None:
+        """Return the output; None if it cannot be known."""
+
+    @abstractmethod
+    def look(self, reader: SensorReader) -> tuple[float, float | None]:
+        """Return the value of the input, and of the output if it is known; change nothing."""
+
+    @abstractmethod
+    def message(self, value: float) -> bytes:
+        """Return what sets the output, as sent on a serial line."""
+
+    @abstractmethod
+    def confirm(self, value: float) -> None:
+        """Set the output.
+
+        Raises:
+            UnconfirmedError: It was sent, and no answer of the device would confirm it.
+            DeviceError: The device did not confirm it.
+        """
+
+    def close(self) -> None:
+        """Disarm and run the close steps; the output stays."""
+        # First: nothing feeds it any more, and it would trip while the close steps run.
+        if self.setup.options.watchdog != "none":
+            self.watchdog.disarm()
+        self.session.finish()
+
+    def release(self) -> None:
+        """Close the link, if open, without a message to the device."""
+        self.link.close()
