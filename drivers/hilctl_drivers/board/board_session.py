@@ -140,7 +140,7 @@ class BoardSession(Session):
         return replace(wire, what=f"STATE {wire.what}", settle_s=source.settle_s)
 
     def identify(self) -> None:
-        """See :meth:`facts`."""
+        """See :meth:`~hilctl_drivers.session.Session.identify` and :meth:`facts`."""
         self.facts()
 
     def input_reader(self, source: Range) -> Callable[[], float]:
@@ -182,7 +182,11 @@ class BoardSession(Session):
         return self._framing.encode(board.HEAD.pack(kind, self._seq) + body)
 
     def facts(self) -> BoardFacts:
-        """Query the properties of the board; raise DeviceError for another protocol."""
+        """Query the properties of the board; raise DeviceError for another protocol.
+
+        It is the first message of a connection, on which messages are numbered anew.
+        """
+        self._seq = 0
         fields, name = self.ask(board.INFO, fields=board.INFO_REPLY)
         # Escaped: it goes to terminals, and a board may send anything.
         found = BoardFacts(ascii(name.decode("latin-1"))[1:-1] or "the board", *fields)

@@ -36,8 +36,8 @@ _FIRST_MAX = 2**32
 class BoardWatchdog(HostWatchdog):
     """The watchdog of a board, if it has one; any message feeds it, and setting it ends a trip."""
 
-    def __init__(self, setup: DacSetup, wire: "BoardWire") -> None:
-        self._wire = wire
+    def __init__(self, setup: DacSetup, session: BoardSession) -> None:
+        self._session = session
         self._timeout_s = setup.options.watchdog_timeout_s or 0.0
         self.safe = setup.chain.output(setup.options.safe_command)
         """Output after a trip."""
@@ -57,11 +57,11 @@ class BoardWatchdog(HostWatchdog):
 
     def tripped(self) -> bool:
         """See :meth:`~hilctl_drivers.wire.HostWatchdog.tripped`."""
-        return self._wire.session.known_state().tripped
+        return self._session.known_state().tripped
 
     def _set(self, timeout_s: float) -> None:
         if self._profile.watchdog != "none":
-            self._wire.session.set_watchdog(timeout_s, self.safe)
+            self._session.set_watchdog(timeout_s, self.safe)
 
 
 class BoardWire(Wire):
@@ -73,7 +73,7 @@ class BoardWire(Wire):
         super().__init__(setup, link)
         self._profile = profile = cast(FrameProfile, setup.writer.profile)
         self.session = BoardSession(profile, link)
-        self.watchdog: BoardWatchdog = BoardWatchdog(setup, self)
+        self.watchdog: BoardWatchdog = BoardWatchdog(setup, self.session)
         self.reads_output = profile.protocol != "hilctl-1"
         self._facts: BoardFacts | None = None
         self._fifo_blocks = getattr(setup.options, "fifo_blocks", 0)
@@ -102,7 +102,6 @@ class BoardWire(Wire):
     def open(self, block_s: float = 0.0) -> list[str]:
         """Connect and check that it is a board that this profile describes."""
         self.link.set_timeout(self.setup.writer.timeout_s + block_s)
-        self.session = BoardSession(self._profile, self.link)
         self.link.open()
         self._facts = facts = self.session.facts()
         low, high = self.setup.output.limits
