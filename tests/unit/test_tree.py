@@ -14,6 +14,7 @@ WITHOUT = {
     "base/device": "the contract of devices: tests/contract/test_devices.py holds each to it",
     "base/events": "one record of plain values; seen in run/shared/test_shared_page.py",
     "cli/options": "types of options; cli/test_commands.py loads every command that has them",
+    "drivers/emulator/registers": "test_modbus_wire.py, and tests/peers with other clients",
     "drivers/session": "what protocols share; drivers/test_dac_setup.py and the protocols' own",
     "drivers/wire": "the contract of wires: drivers/test_dac.py holds a device on each to it",
     "drivers/contract": "the checks of tests/contract; test_bad_devices.py makes each of them fail",

@@ -2,11 +2,8 @@
 
 import struct
 
-import numpy as np
 import pytest
 
-from hilctl_drivers.emulator.labjack_stream import LabJackInput
-from hilctl_drivers.labjack import stream
 from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import read_frame, write_frame
 from hilctl_drivers.profile import load_profile
@@ -99,16 +96,6 @@ def test_values_wait_for_set_loop(device):
     assert device.emulated.rig.command == pytest.approx(0.0)
 
 
-def test_readings_are_fetched_oldest_first(device):
-    device.set_up()
-    device.play(2.5)
-    device.write(4990, u32(1))
-    device.wait(0.0101)
-    count, backlog, status, _, readings = device.data(4)
-    assert (count, backlog, status, len(readings)) == (4, 12, 0, 4)
-    assert device.data(100)[:3] == (6, 0, 0)
-
-
 def test_a_full_buffer_drops_scans_until_it_is_emptied(device):
     """64 readings fit; the drops are told with their number once they are fetched."""
     device.set_up()
@@ -138,39 +125,3 @@ def test_what_it_can_not_do_is_refused(device, what, code):
     with pytest.raises(RefusedError) as refused:
         what(device)
     assert refused.value.code == code
-
-
-def test_calibration_constants_are_read_by_pointer(device):
-    device.write(61810, u32(0x3C4000))
-    (data,) = device.feedback(read_frame(61812, 8))
-    assert struct.unpack(">4f", data) == pytest.approx(
-        (0.000315805780, -0.000315805800, 33523.0, -10.586956522)
-    )
-
-
-def test_a_trip_of_the_watchdog_ends_the_stream(device):
-    for address, data in ((61640, u32(1)), (61642, f32(1.0)), (61604, u32(1)), (61600, u32(1))):
-        device.write(address, data)
-    device.set_up()
-    device.play(*[3.0] * 50)
-    device.write(4990, u32(1))
-    device.wait(5.0)
-    assert device.read(4990) == 0
-    assert device.emulated.rig.command == pytest.approx(-6.0)
-
-
-@pytest.fixture(params=["labjack_t7", "labjack_t4"])
-def streaming(request):
-    return load_profile(request.param).streaming
-
-
-def test_raw_values_become_the_volts_that_made_them(streaming):
-    source = LabJackInput(streaming)
-    source.start(1024)
-    volts = np.linspace(-9.5, 9.5, 20)
-    source.keep(np.append(volts, 1e3))
-    *raw, highest = struct.unpack(">21H", source.fetch(4 + 21)[stream.DATA_HEAD.size :])
-    assert highest == stream.MISSING - 1
-    _, size = stream.calibration_span(streaming.calibration, 0, 0)
-    known = stream.InputCalibration.decode(streaming.calibration, source.flash[:size])
-    np.testing.assert_allclose(known.volts(np.array(raw, dtype=np.uint16)), volts, atol=4e-4)

@@ -2,9 +2,7 @@
 
 import pytest
 
-from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
-from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
 from hilctl_drivers.modbus.pdu import (
     read_pdu,
     reply_data,
@@ -14,13 +12,10 @@ from hilctl_drivers.modbus.pdu import (
     tcp_pdu,
     write_pdu,
     write_read_pdu,
-    write_single_pdu,
 )
 from hilctl_drivers.modbus.register_map import RegisterFormat
-from hilctl_drivers.profile import load_profile
-from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.transport.links import RefusedError
-from tests.unit.drivers.emulator.conftest import MS, emulated_modbus
+from tests.unit.drivers.emulator.conftest import emulated_modbus
 
 FLOAT32 = RegisterFormat("float32")
 
@@ -39,16 +34,6 @@ def ask(wire, pdu, now_ns=0):
     """Send a request over TCP framing and return the checked reply's data."""
     (request,) = requests(wire, tcp_adu(7, 1, pdu))
     return reply_data(pdu, tcp_pdu(wire.answer(request, now_ns).data, 7, 1))
-
-
-def test_coupler_reads_elsewhere_than_it_writes():
-    """On a WAGO register 0 is written as output and read as input; 0x200 reads it back."""
-    wire = ModbusWire("tcp", {1: emulated_modbus("wago_750", "AO0", "AI0")})
-    raw = (8000).to_bytes(2, "big")
-    assert abs(int.from_bytes(ask(wire, write_read_pdu(0, 1, 0, raw)), "big", signed=True)) < 90
-    assert ask(wire, read_pdu(3, 0x200, 1)) == raw
-    ask(wire, write_single_pdu(0, raw))
-    assert ask(wire, read_pdu(3, 0, 1), 10 * MS) != raw
 
 
 @pytest.mark.parametrize(("pdu", "code"), [
@@ -87,30 +72,6 @@ def test_rtu_ignores_others_and_rubbish():
     assert len(reply_data(pdu, rtu_pdu(wire.answer(request, 0).data, 1))) == 2
     assert requests(wire, rtu_adu(2, pdu)) == []
     assert requests(wire, good[:-1] + bytes([good[-1] ^ 1])) == []
-
-
-def test_units_share_a_line_and_a_rig():
-    profile, reader = load_profile("adam_4024"), load_profile("adam_4117")
-    actuator = SimulatedTerfenol(TerfenolOptions())
-    wiring = SimulatedWiring.spread(profile.outputs["AO0"], reader.inputs["AI2"], actuator)
-    bench = Bench(Rig(0, actuator), wiring, WriteLog(None, 0))
-    drives = EmulatedModbus(profile, bench, "AO0", None)
-    reads = EmulatedModbus(reader, bench, None, "AI2")
-    wire = ModbusWire("rtu", {1: drives, 2: reads})
-
-    def transact(unit, pdu, now_ns):
-        (request,) = requests(wire, rtu_adu(unit, pdu))
-        return reply_data(pdu, rtu_pdu(wire.answer(request, now_ns).data, unit))
-
-    transact(1, write_single_pdu(0, (4095).to_bytes(2, "big")), 0)
-    raw = int.from_bytes(transact(2, read_pdu(3, 2, 1), 10 * MS), "big")
-    assert 12.5 * (raw * 20.0 / 65535.0 - 10.0) == pytest.approx(
-        bench.rig.displacement_um, abs=0.01
-    )
-    assert bench.rig.displacement_um > 40.0
-    with pytest.raises(RefusedError):
-        transact(2, write_single_pdu(0, bytes(2)), 10 * MS)
-    assert requests(wire, rtu_adu(3, read_pdu(3, 0, 1))) == []
 
 
 def test_gateway_says_that_a_unit_is_not_there(t7):

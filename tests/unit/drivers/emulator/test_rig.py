@@ -67,27 +67,6 @@ def test_each_value_is_put_out_once(repeats):
     assert (record.fifo.played, record.fifo.underruns) == (60, 0)
 
 
-def test_without_new_values_the_last_is_repeated_and_read():
-    record = Record(repeats=True)
-    record.fifo.queue(np.array([1.0, 2.0]))
-    record.fifo.advance(5 * MS)
-    assert record.commands == [1.0, 2.0, 2.0, 2.0, 2.0]
-    assert len(record.displacement_um) == 5
-    assert (record.fifo.played, record.fifo.underruns) == (5, 3)
-
-
-def test_without_new_values_the_output_is_held_and_not_read():
-    record = Record(repeats=False)
-    record.fifo.queue(np.array([1.0, 2.0]))
-    record.fifo.advance(5 * MS)
-    record.fifo.queue(np.array([3.0]))
-    assert record.fifo.due_ns(3) == 6 * MS
-    record.fifo.advance(6 * MS)
-    assert record.commands == [1.0, 2.0, 3.0]
-    assert record.firsts == [0, 2]
-    assert (record.fifo.played, record.fifo.underruns) == (3, 3)
-
-
 def test_a_stop_keeps_the_queue_and_the_output():
     """Until it is cleared; a new rate counts from 0."""
     record = Record(repeats=True)

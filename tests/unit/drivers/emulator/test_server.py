@@ -8,7 +8,6 @@ from contextlib import ExitStack
 from pathlib import Path
 
 import pytest
-from pymodbus.client import ModbusTcpClient
 
 from hilctl_drivers.emulator.options import parse_fault
 from hilctl_drivers.emulator.server import EmulatorServer
@@ -19,19 +18,6 @@ from tests.fakes import logged, received
 
 FLOAT32 = RegisterFormat("float32")
 MS = 1_000_000
-
-
-def test_independent_client_agrees(served):
-    """pymodbus's client reads and writes the emulated device, with its own conversions."""
-    host, port = served("labjack_t7").split(":")
-    with ModbusTcpClient(host, port=int(port), retries=0) as client:
-        kind = client.DATATYPE.FLOAT32
-        client.write_registers(1000, client.convert_to_registers(4.25, kind))
-        back = client.read_holding_registers(1000, count=2).registers
-        assert client.convert_from_registers(back, kind) == 4.25
-        test = client.read_input_registers(55100, count=2).registers
-        assert test == [0x0011, 0x2233]
-        assert client.read_holding_registers(9999, count=1).exception_code == 2
 
 
 class EchoWire(EmulatedWire):

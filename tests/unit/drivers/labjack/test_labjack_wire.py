@@ -15,7 +15,7 @@ from hilctl_drivers.labjack.labjack_wire import StreamSession, stream_time
 from hilctl_drivers.labjack.stream import VALUES_MAX
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
-from tests.fakes import T7_OPTIONS, FaultyLink, InProcess, InProcessLink, logged, made_safe
+from tests.fakes import T7_OPTIONS, FaultyLink, InProcess, InProcessLink, logged
 
 RATE_HZ = 10_000.0
 BLOCK = 100
@@ -198,18 +198,6 @@ def test_a_bad_answer_is_an_error_and_the_output_can_still_be_made_safe(driven, 
     made.hold(0.0, 8)
 
 
-def test_a_device_that_falls_silent_is_an_error_that_says_what_was_done(driven):
-    made = driven(link=FaultyLink)
-    made.open()
-    made.hold(2.0, 8)
-    made.link.silent_until_s = 1e9
-    text = r"modbus_stream labjack_t7 at 127.0.0.1:502: no answer .*to stream DAC0 and AIN0"
-    with pytest.raises(DeviceError, match=text):
-        made.hold(2.0, 1)
-    with pytest.raises(DeviceError, match="not open"):
-        made.hold(2.0, 1)
-
-
 def test_a_silent_host_is_noticed_by_the_device(driven):
     made = driven(watchdog={"timeout_s": 2.0, "safe_command": -1.0})
     made.open()
@@ -261,18 +249,6 @@ def test_a_stream_of_an_earlier_run_is_stopped(driven):
     assert again.clock.underruns == 0
 
 
-def test_says_what_it_puts_out(driven):
-    made = driven(current_a=None)
-    made.open()
-    assert made.device.output() == pytest.approx(-10.0)
-    assert [each["current_a"] for each in made.events()] == pytest.approx([-10.0])
-    made.hold(2.0, 10)
-    made.device.close()
-    made.open()
-    assert made.device.output() == pytest.approx(2.0)
-    made.device.close()
-
-
 def test_one_message_stops_the_stream_and_writes_the_safe_value(driven):
     made = driven(link=FaultyLink)
     made.open()
@@ -304,21 +280,6 @@ def test_stream_that_is_started_late_is_stopped_by_the_next_attempt(driven):
     made.emulated.device.tick(made.time.now_ns)
     assert made.emulated.rig.command == pytest.approx(0.0, abs=1e-9)
     assert not made.clock.running
-
-
-@pytest.mark.parametrize("silence_s", [0.6, 3.0])
-def test_stream_that_was_silent_is_made_safe_when_it_is_back(driven, silence_s):
-    made = driven(link=FaultyLink)
-    made.open()
-    made.hold(2.0, 10)
-    back_s = made.time() + silence_s
-    made.link.silent_until_s = back_s
-    with pytest.raises(DeviceError):
-        made.hold(2.0, 1)
-    made_safe(made.device, 0.0)
-    written = [each for each in made.events() if each["event"] == "write"][1:]
-    assert 0.0 <= written[0]["monotonic_ns"] * 1e-9 - back_s < 0.2
-    assert made.emulated.rig.command == pytest.approx(0.0, abs=1e-9)
 
 
 def test_the_watchdog_does_not_count_before_it_is_armed(driven):
