@@ -148,18 +148,18 @@ class _Plan:
         self, bench: Bench
     ) -> tuple[AnyDevice, AnyDevice, list[tuple["_Served", EmulatedWire]]]:
         """Return the devices that drive and show the rig, and the wires to serve."""
-        options, served, shown = self._options, self._served, self._shown
+        served, shown = self._served, self._shown
         here, unit = self._profile.usual_unit, self.reader_unit_id
         if served is shown:
             device = self._device(self._profile, bench, self._output, self._sensor)
-            return device, device, [(served, served.wire({here: device}, options))]
+            return device, device, [(served, served.wire({here: device}))]
         device = self._device(self._profile, bench, self._output, None)
         reader = self._device(self._reader, bench, None, self._sensor)
         if self._apart:
-            wires = served.wire({here: device}, options), shown.wire({unit: reader}, options)
+            wires = served.wire({here: device}), shown.wire({unit: reader})
             return device, reader, [(served, wires[0]), (shown, wires[1])]
         unit = self._reader.usual_unit if unit is None else unit
-        both = served.wire({unit: reader, here: device}, options)
+        both = served.wire({unit: reader, here: device})
         return device, reader, [(served, both)]
 
     def _device(
@@ -236,10 +236,10 @@ class _Served:
         on_line = isinstance(profile.link, SerialLineSettings)
         return cls(profile, wanted == "tcp" or not on_line, "rtu", port, faulty)
 
-    def wire(self, devices: dict[Any, Any], options: EmulatorOptions) -> EmulatedWire:
+    def wire(self, devices: dict[Any, Any]) -> EmulatedWire:
         """Return a wire with devices by unit, the last one the first to be asked."""
         if isinstance(self.profile, ModbusProfile):
-            return ModbusWire(self.framing, devices, options.lacking, options.mute)
+            return ModbusWire(self.framing, devices)
         members = list(devices.values())[::-1]
         if isinstance(self.profile, StreamProfile):
             return cast(EmulatedStream, members[0])

@@ -109,17 +109,10 @@ class ModbusWire(EmulatedWire):
     """Devices behind Modbus TCP or RTU: requests from bytes, and replies to bytes.
 
     A device alone on a TCP connection answers to any unit id, as such devices do; on a line, or
-    behind a gateway with others, only to its own. It refuses functions in ``lacking`` as unknown,
-    with exception 1, and never answers those in ``mute``, as some devices do.
+    behind a gateway with others, only to its own.
     """
 
-    def __init__(
-        self,
-        kind: Literal["tcp", "rtu"],
-        devices: Mapping[int, EmulatedModbus],
-        lacking: frozenset[int] = frozenset(),
-        mute: frozenset[int] = frozenset(),
-    ) -> None:
+    def __init__(self, kind: Literal["tcp", "rtu"], devices: Mapping[int, EmulatedModbus]) -> None:
         self._kind = kind
         self._units = devices
         self.devices = tuple(devices.values())
@@ -127,8 +120,6 @@ class ModbusWire(EmulatedWire):
         self._decoder = DecodePDU(is_server=True)
         self._decoder.register(FeedbackPdu)
         self._framer = (FramerSocket if kind == "tcp" else FramerRTU)(self._decoder)
-        self._lacking = lacking
-        self._mute = mute
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
         """Yield complete requests, and remove them and those for other devices."""
@@ -140,10 +131,8 @@ class ModbusWire(EmulatedWire):
             if pdu and (self._kind == "tcp" or unit in self._units):
                 yield struct.pack(">HB", transaction, unit) + pdu
 
-    def answer(self, request: bytes, now_ns: int) -> EmulatedReply | None:
-        """Execute a request; None if it is never answered."""
-        if request[3] in self._mute:
-            return None
+    def answer(self, request: bytes, now_ns: int) -> EmulatedReply:
+        """Execute a request."""
         return self._answered(self._reply(request, now_ns), request)
 
     def _reply(self, request: bytes, now_ns: int) -> ModbusPDU:
@@ -152,7 +141,7 @@ class ModbusWire(EmulatedWire):
         if device is None:
             return ExceptionResponse(function, ExcCodes.GATEWAY_NO_RESPONSE)
         device.request(now_ns)
-        if function in self._lacking | ({23, 76} - {device.profile.exchange}):
+        if function in {23, 76} - {device.profile.exchange}:
             return ExceptionResponse(function, ExcCodes.ILLEGAL_FUNCTION)
         try:
             message = self._decoder.decode(request[3:])
@@ -165,9 +154,9 @@ class ModbusWire(EmulatedWire):
         except (ModbusException, struct.error, KeyError):
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
 
-    def refusal(self, request: bytes) -> EmulatedReply:
-        """Return the exception reply of a device that fails."""
-        return self._answered(ExceptionResponse(request[3], ExcCodes.DEVICE_FAILURE), request)
+    def refusal(self, request: bytes, code: int = ExcCodes.DEVICE_FAILURE) -> EmulatedReply:
+        """Return an exception reply, that of a device that fails by default."""
+        return self._answered(ExceptionResponse(request[3], code), request)
 
     def corrupt_at(self, framed: bytes) -> int:
         """Return the byte of a reply whose damage must be detected."""

@@ -92,7 +92,7 @@ ReaderLine: TypeAlias = Literal["same", "own"]
 
 @dataclass(frozen=True)
 class EmulatorOptions:
-    """What to emulate; initial command, functions, and unit of the reader: Modbus only."""
+    """What to emulate; initial command, and unit of the reader: Modbus only."""
 
     profile: str  # name of a shipped profile, or path of one
     link: LinkKind | None = None  # of both devices; the profiles' own if None
@@ -108,8 +108,6 @@ class EmulatorOptions:
     reader_line: ReaderLine | None = None
     reader_unit_id: int | None = None  # if None its profile's, or the next on the same line
     reader_port: int = 0  # TCP port of its own; 0 for a free one
-    lacking: frozenset[int] = frozenset()  # functions that are refused with exception 1
-    mute: frozenset[int] = frozenset()  # functions that are never answered
     # A rated current or stage that it does not state is that of the limits, or of the wiring.
     actuator: SimulatedOptions = field(default_factory=TerfenolOptions)
     # Amplifier and sensor; spread over the channels' ranges if None.

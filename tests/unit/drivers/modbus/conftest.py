@@ -2,6 +2,7 @@
 
 from contextlib import ExitStack
 from dataclasses import dataclass
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -70,16 +71,30 @@ class Served:
         return logged(self.log)
 
 
+def _limited(wire, answer, lacking, mute, request, now_ns):
+    """Answer as a device that does not know some functions, or never answers some."""
+    if request[3] in mute:
+        return None
+    return wire.refusal(request, 1) if request[3] in lacking else answer(request, now_ns)
+
+
 @pytest.fixture
 def serve(tmp_path):
-    """Return a function that serves a device on a clock that stands still."""
+    """Return a function that serves a device on a clock that stands still.
+
+    It refuses the Modbus functions in ``lacking`` as unknown, and does not answer those in
+    ``mute``.
+    """
     log = tmp_path / "writes.jsonl"
     with ExitStack() as stack:
 
-        def start(profile, reader=None, **options):
+        def start(profile, reader=None, lacking=(), mute=(), **options):
             clock = ManualClock(0)
             chosen = EmulatorOptions(profile, reader=reader, log=log, command=0.0, **options)
-            return Served(stack.enter_context(emulated(chosen, clock)), clock, log)
+            emulator = stack.enter_context(emulated(chosen, clock))
+            for wire in emulator.wires:
+                wire.answer = partial(_limited, wire, wire.answer, lacking, mute)
+            return Served(emulator, clock, log)
 
         yield start
 
