@@ -8,13 +8,13 @@ and a serial line is drained after a timeout.
 from collections.abc import Callable, Sequence
 from dataclasses import replace
 from pkgutil import resolve_name
-from typing import ClassVar
+from typing import Any, ClassVar
 
 from hilctl.base.device import DeviceInfo, DeviceOptions
 from hilctl.base.errors import InputError
 from hilctl.base.types import F64
 from hilctl_drivers.dac_setup import DacSetup
-from hilctl_drivers.device import DacDevice
+from hilctl_drivers.device import DacDevice, details_of
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, Measure
 from hilctl_drivers.transport.links import Link
 from hilctl_drivers.transport.safe_exchange import SafeExchange
@@ -67,24 +67,68 @@ class Dac(DacDevice):
         self.aux = self._wire.aux
 
     def _describe(self) -> DeviceInfo:
-        options, wire = self._options, self._wire
-        details, late_blocks = {}, 0
+        options, setup, chain, wire = self._options, self._setup, self._chain, self._wire
+        writer, reader, rates = setup.writer, setup.reader, wire.rates(wire.block_max)
+        description = f"{writer.profile.title} at {writer.place}: {options.output}"
+        details = writer.profile.provenance()
+        details["link"] = writer.profile.link.model_dump_json()
+        details |= details_of(options.model_dump(mode="json", exclude_none=True))
+        details["input_unit"] = setup.input.unit
+        late_blocks = 0
         if wire.fifo_depth:
             late_blocks = getattr(options, "fifo_blocks", 0)
             details["fifo_depth"] = f"{wire.fifo_depth} samples"
             details["fifo_level"] = f"{late_blocks} blocks"
-        return self._setup.info(
-            self.KIND,
-            wire.rates(wire.block_max),
+        files = {"profile.yaml": options.profile.text}
+        if options.reader is not None:
+            files["reader_profile.yaml"] = options.reader.profile.text
+        held = holds = writer.holds  # once, because a name server may be slow
+        if setup.reads_elsewhere:
+            holds = tuple(dict.fromkeys(held + reader.holds))
+            description += f"; {reader.profile.title}{setup.reader_place}"
+            details |= reader.profile.provenance("reader_")
+            details["reader_link"] = reader.profile.link.model_dump_json()
+        position = f" in {setup.input.unit}" if setup.input.per_unit("um") else ""
+        description += f"{':' if setup.reads_elsewhere else ','} {options.input}{position}"
+        watchdog: dict[str, Any] = {}
+        if options.watchdog != "none":
+            watchdog = {
+                "watchdog_command": options.watchdog.safe_command,
+                "watchdog_timeout_s": options.watchdog.timeout_s,
+                "watchdog_reason": options.watchdog.reason,
+                "arm_s": wire.watchdog.arm_s,
+            }
+        unit = "" if writer.unit is None else f"unit {writer.unit}, "
+        return DeviceInfo(
+            name=self.KIND,
+            description=description,
+            command_unit=chain.command_unit,
+            command_min=chain.command_range[0],
+            command_max=chain.command_range[1],
+            command_step=chain.command_step,
+            sensor_min_um=chain.displacement_range[0],
+            sensor_max_um=chain.displacement_range[1],
+            max_rate_hz=rates.highest_hz,
+            rate_note=rates.note,
             buffered=wire.fifo_depth > 0,
             fifo_depth=wire.fifo_depth,
             latency_blocks=late_blocks,
             measures_command=self._measure is not None,
             reads_output=wire.reads_output,
-            arm_s=0.0 if options.watchdog == "none" else wire.watchdog.arm_s,
             safe_note="; ".join(filter(None, (self._late_note(), wire.unconfirmed))),
             confirms=not wire.unconfirmed,
+            files=files,
+            calibration=options.calibration_file,
+            holds=holds,
+            identity=writer.identity(held),
+            output=f"{unit}{getattr(setup.output, 'address', options.output)}",
             details=details,
+            ages_readings=self._reader.session.AGES,
+            aux=tuple(each.channel for each in setup.aux),
+            digital_output=options.digital_output or "",
+            digital_output_s=0.0 if (pulse := setup.digital_time) is None else pulse.total_s,
+            digital_input=options.digital_input or "",
+            **watchdog,
         )
 
     def _late_note(self) -> str:

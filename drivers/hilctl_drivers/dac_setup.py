@@ -5,9 +5,8 @@ from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, Self, cast
 
-from hilctl.base.device import AuxChannel, DeviceInfo
+from hilctl.base.device import AuxChannel
 from hilctl.base.errors import InputError
-from hilctl_drivers.device import details_of
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.profile_base import BaseProfile, Range
 from hilctl_drivers.session import SensorReader, SteppedSession, session_class
@@ -92,10 +91,11 @@ class DacSetup:
     @property
     def reader_name(self) -> str:
         """Name of the reader in messages; empty if it is the device with the output."""
-        return f"reader {self.reader.name}{self._reader_place}" if self.reads_elsewhere else ""
+        return f"reader {self.reader.name}{self.reader_place}" if self.reads_elsewhere else ""
 
     @property
-    def _reader_place(self) -> str:
+    def reader_place(self) -> str:
+        """Unit and address of the reader, in messages."""
         unit = "" if self.reader.unit is None else f", unit {self.reader.unit}"
         return f"{unit} at {self.reader.place}"
 
@@ -177,57 +177,6 @@ class DacSetup:
         if settle_s * most_hz > 1.0:
             most_hz, whose = 1.0 / settle_s, f"settling {1e3 * settle_s:.2f} ms: {whose}"
         return RateLimit.of(wire, most_hz, whose, lowest_hz)
-
-    def info(self, kind: str, rates: RateLimit, **more: Any) -> DeviceInfo:
-        """Return the description of a device of this kind; ``more`` depends on the protocol."""
-        options, writer, reader, chain = self.options, self.writer, self.reader, self.chain
-        description = f"{writer.profile.title} at {writer.place}: {options.output}"
-        details = writer.profile.provenance()
-        details["link"] = writer.profile.link.model_dump_json()
-        details |= details_of(options.model_dump(mode="json", exclude_none=True))
-        details["input_unit"] = self.input.unit
-        details |= more.pop("details", {})
-        files = {"profile.yaml": options.profile.text}
-        if options.reader is not None:
-            files["reader_profile.yaml"] = options.reader.profile.text
-        if self.reads_elsewhere:
-            description += f"; {reader.profile.title}{self._reader_place}"
-            details |= reader.profile.provenance("reader_")
-            details["reader_link"] = reader.profile.link.model_dump_json()
-        position = f" in {self.input.unit}" if self.input.per_unit("um") else ""
-        description += f"{':' if self.reads_elsewhere else ','} {options.input}{position}"
-        if options.watchdog != "none":
-            more |= {
-                "watchdog_command": options.watchdog.safe_command,
-                "watchdog_timeout_s": options.watchdog.timeout_s,
-                "watchdog_reason": options.watchdog.reason,
-            }
-        held = writer.holds  # once, because a name server may be slow
-        unit = "" if writer.unit is None else f"unit {writer.unit}, "
-        return DeviceInfo(
-            name=kind,
-            description=description,
-            command_unit=chain.command_unit,
-            command_min=chain.command_range[0],
-            command_max=chain.command_range[1],
-            command_step=chain.command_step,
-            sensor_min_um=chain.displacement_range[0],
-            sensor_max_um=chain.displacement_range[1],
-            max_rate_hz=rates.highest_hz,
-            rate_note=rates.note,
-            files=files,
-            calibration=options.calibration_file,
-            holds=tuple(dict.fromkeys(held + (reader.holds if self.reads_elsewhere else ()))),
-            identity=writer.identity(held),
-            output=f"{unit}{getattr(self.output, 'address', options.output)}",
-            details=details,
-            ages_readings=session_class(self.reader).AGES,
-            aux=tuple(each.channel for each in self.aux),
-            digital_output=options.digital_output or "",
-            digital_output_s=0.0 if (pulse := self.digital_time) is None else pulse.total_s,
-            digital_input=options.digital_input or "",
-            **more,
-        )
 
 
 def _aux_source(name: str, options: AuxInput, reader: Endpoint, writer: Endpoint) -> AuxSource:
