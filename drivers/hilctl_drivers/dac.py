@@ -5,12 +5,13 @@ auxiliary channel, and to feed a strict watchdog. No request is sent before the 
 and a serial line is drained after a timeout.
 """
 
-from collections.abc import Callable, Sequence
+import math
+from collections.abc import Callable
 from dataclasses import replace
 from pkgutil import resolve_name
 from typing import Any, ClassVar
 
-from hilctl.base.device import DeviceInfo, DeviceOptions
+from hilctl.base.device import DeviceInfo, DeviceOptions, DeviceReadings
 from hilctl.base.errors import InputError
 from hilctl.base.types import F64
 from hilctl_drivers.dac_setup import DacSetup
@@ -165,10 +166,6 @@ class Dac(DacDevice):
     def _rates(self, block: int) -> RateLimit:
         return self._wire.rates(block)
 
-    def _check_block(self, block: int) -> None:
-        super()._check_block(block)
-        self._wire.check_block(block)
-
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Connect, end what an earlier run has left, init steps, one reading, test of the output.
 
@@ -184,6 +181,8 @@ class Dac(DacDevice):
         wire.start(self._reader, sample_rate_hz, block)
         wire.session.check_errors()
         self.transactions = wire.requests
+        if not wire.fifo_depth:  # otherwise the wire reads them with each block
+            self._aux_readers = self._setup.aux_readers(wire.link, self._reader.link)
 
     def _plan_feeding(self, ticks_per_s: float) -> None:
         """Take the rate of exchanges, or raise DeviceError if it is too low for the watchdog."""
@@ -210,34 +209,29 @@ class Dac(DacDevice):
     ) -> None:
         self._wire.exchange(first_sample, command, displacement_um)
         if self._measure is not None:
-            self._measure_output(measured)
+            measured[0] = self._measured(self._measure)
         if self._feed_every:
             self._ticks += 1
             if self._ticks % self._feed_every == 0:
                 self._wire.watchdog.feed()
 
-    def _measure_output(self, measured: F64) -> None:
-        if self._measure is not None:
-            gain, offset = self._measured_by
-            measured[0] = self._measure() * gain + offset
-
-    def _readers_of_aux(self) -> Sequence[Callable[[], float]]:
-        if self._wire.fifo_depth:
-            return ()  # the wire reads them with each block
-        return self._setup.aux_readers(self._wire.link, self._reader.link)
+    def _measured(self, measure: Callable[[], float]) -> float:
+        """Return the command as measured."""
+        gain, offset = self._measured_by
+        return measure() * gain + offset
 
     def _output(self) -> float | None:
         held = self._wire.read()
         return None if held is None else self._chain.command(held)
 
-    def _look(self) -> tuple[float, float | None]:
+    def _look(self) -> DeviceReadings:
         self._connect()
+        chain, measure = self._chain, self._measure
         reading, held = self._wire.look(self._reader)
-        command = None if held is None else self._chain.command(held)
-        return self._chain.displacement_um(reading), command
-
-    def _tripped(self) -> bool:
-        return self._wire.watchdog.tripped()
+        command = None if held is None else chain.command(held)
+        measured = math.nan if measure is None else self._measured(measure)
+        tripped = self._wire.watchdog.tripped()
+        return DeviceReadings(chain.displacement_um(reading), command, measured, tripped)
 
     def _set_digital(self, high: bool) -> None:
         self._wire.session.set_digital(self._setup.digital_output, high=high)

@@ -57,6 +57,7 @@ class DacDevice(ABC):
         self.aux: F64 = np.full(len(info.aux), np.nan)
         """Newest values of the auxiliary channels."""
         self._aux_readers: Sequence[Callable[[], float]] = ()
+        """Read the auxiliary channels, one per exchange in turn; empty if exchanges fill them."""
         self._next_aux = 0
         self._digital_is_low = False
         self.safe_command = math.nan
@@ -90,7 +91,6 @@ class DacDevice(ABC):
             self._check_block(block)
             self.check_rate(sample_rate_hz, block)
             self._open(sample_rate_hz, block)
-            self._aux_readers = self._readers_of_aux()
             for _ in self._aux_readers:
                 self._read_aux()
             # A missing channel must show before the output moves.
@@ -136,12 +136,11 @@ class DacDevice(ABC):
         if self._block:
             raise self._error(action, "open")
         try:
-            displacement_um, output = self._look()
-            if self._curve is not None:
-                displacement_um = float(np.interp(displacement_um, *self._curve))
-            measured = np.full(1, np.nan)
-            self._measure_output(measured)
-            return DeviceReadings(displacement_um, output, measured.item(), self._tripped())
+            found = self._look()
+            if self._curve is None:
+                return found
+            corrected_um = float(np.interp(found.displacement_um, *self._curve))
+            return found._replace(displacement_um=corrected_um)
         except DeviceError as error:
             raise self._error(action, str(error)) from None
         finally:
@@ -233,13 +232,6 @@ class DacDevice(ABC):
         finally:
             self._release()
 
-    def _readers_of_aux(self) -> Sequence[Callable[[], float]]:
-        """Return functions that read the auxiliary channels, one per exchange in turn.
-
-        Empty if exchanges fill :attr:`aux`.
-        """
-        return ()
-
     def _read_aux(self) -> None:
         """Read the next auxiliary channel."""
         k = self._next_aux
@@ -276,17 +268,9 @@ class DacDevice(ABC):
         """Return the output of a device that is open; None if it cannot be known."""
         return None
 
-    def _look(self) -> tuple[float, float | None]:
-        """Connect, and return displacement and output; :meth:`_release` follows."""
+    def _look(self) -> DeviceReadings:
+        """Connect, and return the readings without their correction; :meth:`_release` follows."""
         raise DeviceError("it can't be read without being set up")
-
-    def _tripped(self) -> bool:
-        """Return whether the device's watchdog has tripped; False if it cannot be known."""
-        return False
-
-    def _measure_output(self, measured: F64) -> None:
-        """Set ``measured[0]`` to the command as measured; NaN if it is not measured."""
-        measured[0] = math.nan
 
     @abstractmethod
     def _exchange(
@@ -364,6 +348,12 @@ def details_of(values: Mapping[str, Any]) -> dict[str, str]:
         name: value if isinstance(value, str) else json.dumps(value, ensure_ascii=False)
         for name, value in values.items()
     }
+
+
+def largest_block(fifo_blocks: int, depth: int) -> tuple[int, str]:
+    """Return the largest block with a FIFO of ``depth``, and the reason for messages."""
+    note = f": fifo_blocks + 1 of them must fit into the FIFO, {depth} samples"
+    return max(1, depth // (fifo_blocks + 1)), note
 
 
 def check_fifo(block: int, fifo_blocks: int, depth: int) -> None:

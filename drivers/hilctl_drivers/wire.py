@@ -72,9 +72,6 @@ class Wire(ABC):
     def rates(self, block: int) -> RateLimit:
         """Return the sample rates that it can keep with this block."""
 
-    def check_block(self, block: int) -> None:  # noqa: B027
-        """Raise DeviceError for a block within ``block_max`` that it does not support."""
-
     def open(self, block_s: float = 0.0) -> list[str]:
         """Connect, identify the device, and return errors of earlier sessions.
 

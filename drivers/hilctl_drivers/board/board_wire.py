@@ -22,7 +22,7 @@ from hilctl_drivers.board.board_session import (
     watchdog_time,
 )
 from hilctl_drivers.dac_setup import DacSetup
-from hilctl_drivers.device import check_fifo, check_next
+from hilctl_drivers.device import check_fifo, check_next, largest_block
 from hilctl_drivers.session import SensorReader
 from hilctl_drivers.transport.links import WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import check_read_back, try_out
@@ -86,6 +86,9 @@ class BoardWire(Wire):
         if setup.reads_elsewhere:
             raise InputError("reader must be omitted: a board with a FIFO samples its own input")
         self.block_max, self.fifo_depth = streaming.block_max, streaming.fifo_depth
+        fitting, note = largest_block(self._fifo_blocks, self.fifo_depth)
+        if fitting < self.block_max:
+            self.block_max, self.block_note = fitting, note
 
     def rates(self, block: int) -> RateLimit:
         """See :meth:`~hilctl_drivers.wire.Wire.rates`."""
@@ -93,11 +96,6 @@ class BoardWire(Wire):
         lowest_hz = 0.0 if streaming == "none" else streaming.rate_min_hz
         wire = self.setup.after_reading(exchange_time(self._profile, block))
         return self.setup.rates(wire, lowest_hz, settle_s(self._profile))
-
-    def check_block(self, block: int) -> None:
-        """See :meth:`~hilctl_drivers.wire.Wire.check_block`."""
-        if self.fifo_depth:
-            check_fifo(block, self._fifo_blocks, self.fifo_depth)
 
     def open(self, block_s: float = 0.0) -> list[str]:
         """Connect and check that it is a board that this profile describes."""

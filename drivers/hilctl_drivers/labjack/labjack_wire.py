@@ -17,7 +17,7 @@ import numpy.typing as npt
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.dac_setup import DacSetup
-from hilctl_drivers.device import check_fifo, check_next
+from hilctl_drivers.device import check_fifo, check_next, largest_block
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.stream import ENABLE, VALUES_MAX, InputCalibration, f32, u32
 from hilctl_drivers.modbus.modbus_profile import LabJackStreaming, ModbusInput, ModbusProfile
@@ -243,9 +243,7 @@ class LabJackWire(RegisterWire):
         self._sources = [profile.wire_address(cast(ModbusInput, each)) for each in inputs]
         self._fifo_blocks: int = getattr(options, "fifo_blocks", 0)
         self.fifo_depth = streaming.fifo_depth
-        self.block_max = max(1, streaming.fifo_depth // (self._fifo_blocks + 1))
-        rule = f"fifo_blocks + 1 of them must fit into the FIFO, {self.fifo_depth} samples"
-        self.block_note = f": {rule}"
+        self.block_max, self.block_note = largest_block(self._fifo_blocks, self.fifo_depth)
         self.buffer = StreamSession(
             self.session, streaming, options.reply_timeout_s, profile.turnaround_s
         )

@@ -3,7 +3,7 @@
 import numpy as np
 import pytest
 
-from hilctl.base.device import DeviceInfo
+from hilctl.base.device import DeviceInfo, DeviceReadings
 from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl_drivers.device import DacDevice
 
@@ -38,7 +38,7 @@ class NotingDac(DacDevice):
 
     def _look(self):
         self._note("look")
-        return 1.0, None
+        return DeviceReadings(1.0, None)
 
     def _exchange(self, first_sample, command, displacement_um, measured):
         self._note("exchange")
