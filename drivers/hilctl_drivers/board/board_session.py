@@ -139,6 +139,10 @@ class BoardSession(Session):
         wire = _message_time(profile, board.state_sizes(sum(each.format.size for each in values)))
         return replace(wire, what=f"STATE {wire.what}", settle_s=source.settle_s)
 
+    def restart(self) -> None:
+        """Number messages from the first again, as on a new connection."""
+        self._seq = 0
+
     def identify(self) -> None:
         """See :meth:`~hilctl_drivers.session.Session.identify` and :meth:`facts`."""
         self.facts()
@@ -182,11 +186,7 @@ class BoardSession(Session):
         return self._framing.encode(board.HEAD.pack(kind, self._seq) + body)
 
     def facts(self) -> BoardFacts:
-        """Query the properties of the board; raise DeviceError for another protocol.
-
-        It is the first message of a connection, on which messages are numbered anew.
-        """
-        self._seq = 0
+        """Query the properties of the board; raise DeviceError for another protocol."""
         fields, name = self.ask(board.INFO, fields=board.INFO_REPLY)
         # Escaped: it goes to terminals, and a board may send anything.
         found = BoardFacts(ascii(name.decode("latin-1"))[1:-1] or "the board", *fields)

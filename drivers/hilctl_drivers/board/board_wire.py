@@ -101,6 +101,7 @@ class BoardWire(Wire):
         """Connect and check that it is a board that this profile describes."""
         self.link.set_timeout(self.setup.writer.timeout_s + block_s)
         self.link.open()
+        self.session.restart()
         self._facts = facts = self.session.facts()
         low, high = self.setup.output.limits
         slack = 1e-6 * (high - low)
