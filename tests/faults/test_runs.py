@@ -77,12 +77,12 @@ def test_signals_ramp_down(tmp_path, number, code, words):
     assert words in recording.events[-1].text
 
 
-def test_impatience_does_not_skip_the_ramp(tmp_path):
-    """Ctrl-C ends the run by its ramp, and further signals during the ramp change nothing."""
+def test_further_signals_do_not_skip_the_ramp(tmp_path):
+    """The first signal determines the exit code and the reason."""
     run = started(tmp_path)
     run.await_size()
-    for _ in range(5):
-        run.process.send_signal(signal.SIGINT)
+    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+        run.process.send_signal(number)
         time.sleep(0.02)
     returned, printed = run.ended()
     assert (returned, printed["code"]) == (130, "stopped")
