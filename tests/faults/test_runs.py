@@ -81,7 +81,7 @@ def test_further_signals_do_not_skip_the_ramp(tmp_path):
     """The first signal determines the exit code and the reason."""
     run = started(tmp_path)
     run.await_size()
-    for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP, signal.SIGINT):
+    for number in (signal.SIGINT, signal.SIGINT, signal.SIGHUP, signal.SIGTERM):
         run.process.send_signal(number)
         time.sleep(0.02)
     returned, printed = run.ended()
