@@ -281,11 +281,12 @@ def test_a_run_that_does_not_start_is_told_as_in_the_foreground(tmp_path):
     assert hilctl("status")["runs"] == []
 
 
-def test_a_short_run_may_be_over_when_detach_returns(tmp_path):
-    """It is no failure."""
+def test_short_run_may_have_ended_when_detach_returns(tmp_path):
     path = written(tmp_path, waveform=sine(5.0, 0.2, soft_start_s=0.0))
-    done = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach")
-    assert done["recording"] == str(tmp_path / "run.mcap")
+    output = tmp_path / "run.mcap"
+    output.touch()
+    done = hilctl("run", path, "--output", output, "--detach", "--overwrite", "--take-over")
+    assert done["recording"] == str(output)
 
 
 def test_a_run_that_is_killed_while_it_starts_leaves_nothing(tmp_path):

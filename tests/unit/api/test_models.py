@@ -1,7 +1,5 @@
 """Identify, refine and compare models from Python."""
 
-from contextlib import contextmanager
-
 import numpy as np
 import pytest
 
@@ -34,36 +32,6 @@ def test_a_model_is_identified_and_written(table, tmp_path):
     assert found.verdict.grade != "not a model"
     assert load_model(output).kind == "ppi"
     assert texts
-
-
-def test_arguments_are_passed_on(monkeypatch):
-    seen = {}
-    monkeypatch.setattr(
-        "hilctl.lab.comparison.compare.compare",
-        lambda paths, models, **named: seen.update(named, paths=paths, models=models),
-    )
-    api.compare("a.mcap", ["ppi"], settings={"block": 5}, frequencies_hz=[1.0])
-    assert [str(path) for path in seen["paths"]] == ["a.mcap"]
-    assert (seen["models"], seen["settings"], seen["points"]) == (["ppi"], ["block=5"], 300)
-
-
-@pytest.mark.parametrize(
-    ("model", "asked", "where"),
-    [("auto", None, "threads"), ("ppi", None, "none"), ("ppi", "processes", "processes")],
-)
-def test_default_scheduler(monkeypatch, model, asked, where):
-    chosen = []
-
-    @contextmanager
-    def workers(scheduler):
-        chosen.append(scheduler)
-        raise InputError(scheduler)
-        yield
-
-    monkeypatch.setattr("hilctl.api.models.workers", workers)
-    with pytest.raises(InputError):
-        api.identify("a.mcap", model=model, scheduler=asked)
-    assert chosen == [where]
 
 
 @pytest.fixture

@@ -60,11 +60,3 @@ def test_other_files_are_refused(tmp_path):
         api.read(tmp_path / "x.mcap")
     with pytest.raises(InputError):
         api.summarize(tmp_path / "y.mcap")
-
-
-def test_dead_runs_are_finished_before_anything_is_read(file, monkeypatch):
-    finished = []
-    monkeypatch.setattr("hilctl.api.recordings.finish_dead_runs", lambda: finished.append(True))
-    for act in (api.read, api.summarize, api.replay):
-        act(file)
-    assert len(finished) == 3

@@ -50,15 +50,6 @@ def test_a_real_device_does_not_run_fast(tmp_path):
     assert not [*tmp_path.iterdir()]
 
 
-def test_a_run_in_real_time_is_started(monkeypatch, tmp_path):
-    monkeypatch.setattr("hilctl.api.runs.start_run", lambda *given, **more: (given, more))
-    seen = print
-    given, more = api.run(SINE, settings={"block": 5}, overwrite=True, on_progress=seen)
-    assert given == (SINE, ["block=5"], None, True, seen)
-    assert more == {"take_over": False}
-    assert api.run(SINE, take_over=True)[1] == {"take_over": True}
-
-
 def test_init_writes_a_valid_experiment(tmp_path):
     written = api.init("simulated_piezo", tmp_path / "first.yaml", settings={"safe.ramp_s": 2.0})
     assert (written.path, written.to_be_set) == (tmp_path / "first.yaml", {})

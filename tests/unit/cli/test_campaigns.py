@@ -1,6 +1,5 @@
 """Commands that run an experiment repeatedly: campaign, sweep, learn."""
 
-import json
 from itertools import chain
 
 import numpy as np
@@ -164,33 +163,7 @@ def learn(monkeypatch, tmp_path, hilctl):
     return run
 
 
-def test_learn_prints_iterations_and_correction(learn, tmp_path):
-    _, shown, _ = learn()
-    assert all(value in shown for value in ("0.5000 %", "0.0500 %", "800 Hz"))
-    file = (tmp_path / "correction.yaml").resolve()
-    assert f"--set 'compensator.correction=\"{file}\"'" in shown
-    assert (tmp_path / "correction.yaml").is_file()
-
-
-def test_learn_prints_one_json_object(learn, tmp_path):
-    printed = json.loads(learn("--json")[1])
-    assert printed["reason"] == "noise floor"
-    assert printed["output"] == str(tmp_path / "correction.yaml")
-    assert printed["folder"] == str(tmp_path / "correction-runs")
-
-
 @pytest.mark.parametrize(("how", "code"), [({"stop_signal": 2}, 130), ({"fault": True}, 3)])
 def test_exit_code_of_learn(learn, tmp_path, how, code):
     assert learn(**how)[0] == code
     assert (tmp_path / "correction.yaml").is_file()
-
-
-def test_learn_refuses_existing_files(learn, tmp_path):
-    (tmp_path / "correction-runs").mkdir()
-    (tmp_path / "correction-runs" / "run-00.mcap").touch()
-    code, _, err = learn()
-    assert (code, "--folder" in err) == (2, True)
-    (tmp_path / "correction.yaml").write_text("mine")
-    code, _, err = learn()
-    assert (code, "--overwrite" in err) == (2, True)
-    assert (tmp_path / "correction.yaml").read_text() == "mine"

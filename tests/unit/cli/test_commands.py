@@ -10,7 +10,6 @@ from types import SimpleNamespace
 import pytest
 import typer
 
-from hilctl import __version__
 from hilctl.base.errors import InputError
 from hilctl.cli.commands import COMMANDS, app, load
 
@@ -52,19 +51,6 @@ def test_similar_command_is_suggested():
     assert "'status'" in ended.stderr
 
 
-@pytest.mark.parametrize("name", ["check", "report"])
-def test_eof_error_is_not_reported_as_ctrl_d(hilctl, monkeypatch, name):
-    def ended():
-        raise EOFError("ran out")
-
-    monkeypatch.setattr("hilctl.cli.reports.report", ended)
-    monkeypatch.setattr("hilctl.cli.run.check", ended)
-    code, _, stderr = hilctl(name)
-    assert code == 3
-    assert stderr.startswith("hilctl: ")
-    assert "ran out" in stderr
-
-
 def completing(words):
     """Return the environment in which bash asks for the last of some words."""
     words = words.split(" ")
@@ -100,6 +86,7 @@ def test_shell_completes_options_and_values(words, some, tmp_path, monkeypatch, 
     load(words.split(" ")[0])  # it must not import the fake run for all later tests
     card = SimpleNamespace(name="rig-1", experiment="rig.yaml")
     monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(card=card)])
+    monkeypatch.setattr(sys.modules["__main__"], "__package__", "")  # also by python -m pytest
     for name, value in completing(f"hilctl {words}").items():
         monkeypatch.setenv(name, value)
     code, out, err = hilctl()
@@ -152,7 +139,3 @@ main()
 """
     ended = in_a_process(code, "--help")
     assert ended.returncode == 0, ended.stderr
-
-
-def test_version(hilctl):
-    assert hilctl("--version")[1] == f"hilctl {__version__}\n"

@@ -10,7 +10,7 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl.cli.console import compile_progress, print_rich, progress_bar, table
-from hilctl.cli.output import Verbosity, safe_streams
+from hilctl.cli.output import safe_streams
 
 
 class Terminal(io.StringIO):
@@ -93,15 +93,6 @@ def test_each_kernel_is_named(monkeypatch):
     assert lines[1:] == ["  inner", "  inner"]
     compile_something()
     assert len(shown.getvalue().splitlines()) == 3
-
-
-@pytest.mark.parametrize(("quiet", "stream"), [(True, Terminal()), (False, io.StringIO())])
-def test_compilation_is_not_shown_if_quiet_or_without_a_terminal(monkeypatch, quiet, stream):
-    monkeypatch.setattr("sys.stderr", stream)
-    monkeypatch.setattr(Verbosity, "quiet", quiet)
-    with compile_progress():
-        compile_something()
-    assert stream.getvalue() == ""
 
 
 def test_narrow_tables_keep_their_numbers(monkeypatch, capsys):

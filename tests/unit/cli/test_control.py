@@ -21,52 +21,11 @@ def stopped(name, *, ended, error=""):
     return {"name": name, "recording": f"{name}.mcap", "ended": ended, "error": error}
 
 
-def test_status_without_runs_is_an_empty_list(hilctl, json_of):
-    assert json_of("status") == (0, {"runs": []})
-    assert hilctl("status")[:2] == (0, "no active run\n")
-
-
 def test_stop_timeout_has_exit_code_3(answering, hilctl):
     answering("stop_runs", lambda runs, wait_s: [stopped("a", ended=False)])
     code, shown, _ = hilctl("stop", "--wait", "2")
     assert code == 3
     assert "still active" in shown
-
-
-def test_stop_all_reports_each_run(answering, hilctl, json_of):
-    chosen = []
-
-    def stop_runs(runs, wait_s):
-        chosen.append((runs, wait_s))
-        return [stopped(name, ended=name == "a") for name in runs]
-
-    answering("stop_runs", stop_runs)
-    answering("active_runs", lambda: ["a", "b"])
-    code, found = json_of("stop", "--all")
-    assert code == 3
-    assert [each["ended"] for each in found["runs"]] == [True, False]
-    answering("active_runs", list)
-    assert hilctl("stop", "--all")[0] == 0
-    assert chosen == [(["a", "b"], 60.0), ([], 60.0)]
-    assert hilctl("stop", "--all", "--run", "a")[0] == 2
-
-
-def test_set_prints_the_new_values(answering, hilctl):
-    asked = []
-    answer = {"gain": 0.5, "offset": -2.0, "over_s": 1.5, "inverse": None}
-    answering("set_run", lambda run, **wanted: asked.append(wanted) or answer)
-    code, shown, _ = hilctl("set", "gain=0.5", "offset=-2", "--over", "1.5")
-    assert code == 0
-    assert "gain 0.5" in shown
-    assert asked == [{"gain": 0.5, "offset": -2.0, "over_s": 1.5}]
-
-
-def test_mark_joins_its_words(answering, hilctl, json_of):
-    sent = []
-    answering("mark_run", lambda run, text: sent.append(text) or {"sample": 600, "text": text})
-    assert "sample 600" in hilctl("mark", "tapped", "the stage")[1]
-    assert json_of("mark", "tapped")[1]["sample"] == 600
-    assert sent == ["tapped the stage", "tapped"]
 
 
 PATH = "/home/somebody/a/folder/with/a/long/name/recordings/2026-11-21_terfenol_sine_6a.mcap"

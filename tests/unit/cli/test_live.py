@@ -16,7 +16,6 @@ from hilctl.base.events import Event
 from hilctl.cli import live as module
 from hilctl.cli.console import print_rich
 from hilctl.cli.live import View, print_lines
-from hilctl.run.run_folder import run_folder
 
 
 class FakeFeed:
@@ -265,85 +264,3 @@ def run(monkeypatch):
     }.items():
         monkeypatch.setattr(f"hilctl.cli.live.{name}", value)
     return made
-
-
-def test_final_state_is_printed(run, monkeypatch, capsys):
-    module.watch("demo")
-    assert capsys.readouterr().out == "demo-7: stopped: by hand\n"
-    run.feed.ended = False
-
-    def interrupted(feed):
-        raise KeyboardInterrupt
-
-    monkeypatch.setattr(module, "print_lines", interrupted)
-    module.watch(None)
-    assert "hilctl stop" in capsys.readouterr().out
-
-
-def test_subprocess_shows_the_run_of_its_parent(run, monkeypatch, capsys):
-    other = SimpleNamespace(card=SimpleNamespace(name="x", supervisor=8))
-    found = iter([[], [other], [other, run]])
-    monkeypatch.setattr(module, "active_runs", lambda: next(found))
-    module.main()
-    monkeypatch.setattr(module.os, "getppid", lambda: 1)
-    module.main()
-    assert capsys.readouterr().out == "demo-7: stopped: by hand\n"
-
-
-def test_run_that_ended_before_it_was_read_is_one_message(run, monkeypatch, capsys):
-    def refuse(folder):
-        raise RunError("demo-7: gone")
-
-    monkeypatch.setattr(module, "RunReader", refuse)
-    module.main()
-    assert capsys.readouterr().err == "hilctl: demo-7: gone\n"
-
-
-@pytest.fixture
-def served(monkeypatch):
-    """Replace the servers; return their arguments."""
-    given = {}
-
-    def serve(chosen, over, on_url, port, *, foxglove):
-        given.update(chosen=chosen, over=over, port=port)
-        on_url("ws://127.0.0.1:5" if foxglove else "http://127.0.0.1:5/#x")
-
-    monkeypatch.setattr(module, "serve_runs", serve)
-    return given
-
-
-def test_address_is_printed(served, hilctl, json_of):
-    assert hilctl("live", "--port", "5")[1] == "live page: http://127.0.0.1:5/#x\n"
-    assert served["port"] == 5
-    assert served["chosen"]([]) is None
-    assert served["chosen"](["a", "b"]) == "a"
-    assert not served["over"](None)
-    assert json_of("live")[1] == {"url": "http://127.0.0.1:5/#x"}
-
-
-@pytest.mark.parametrize(("words", "port"), [([], None), (["--port", "0"], 0)])
-def test_foxglove_has_a_default_port(served, hilctl, words, port):
-    assert hilctl("live", "--foxglove", *words)[1] == "Foxglove server: ws://127.0.0.1:5\n"
-    assert served["port"] == port
-
-
-def test_run_is_found_by_the_beginning_of_its_name(served, hilctl, tmp_path):
-    with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
-        assert hilctl("live", "de")[0] == 0
-        assert served["chosen"]([]) == folder
-
-
-def test_unknown_run_is_refused(served, hilctl, tmp_path):
-    assert hilctl("live", "x")[0] == 2
-    with run_folder("demo", tmp_path / "a.mcap", 1.0):
-        code, _, err = hilctl("live", "x")
-    assert (code, "'x'" in err) == (2, True)
-    assert not served
-
-
-def test_server_ends_if_its_run_ended_before_it_was_read(served, hilctl, tmp_path):
-    nothing = SimpleNamespace(feed=lambda name: None)
-    with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
-        hilctl("live", folder.card.name)
-        assert not served["over"](nothing)
-    assert served["over"](nothing)

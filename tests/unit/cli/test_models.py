@@ -5,8 +5,7 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.base.errors import InputError
-from hilctl.cli.models import _numbers, column_of, headings, notes, render_comparison, table_rows
+from hilctl.cli.models import headings, notes, render_comparison, table_rows
 from hilctl.experiment.examples import examples_folder
 from hilctl.lab.comparison.compare import compare
 from hilctl.lab.identify.settings import IdentifySettings
@@ -78,18 +77,6 @@ def test_table_has_a_column_per_trial(comparison):
     assert rows[2][1:3] == ["-", "-"]
     assert render_comparison(comparison) is not None
     assert any("simulated" in note for note in notes(comparison))
-
-
-def test_frequencies_are_numbers():
-    assert _numbers(None) is None
-    assert _numbers("1, 2.5,1e2") == [1.0, 2.5, 100.0]
-    with pytest.raises(InputError, match="--frequencies"):
-        _numbers("ten")
-
-
-@pytest.mark.parametrize(("text", "column"), [("3", 3), ("drive", "drive"), (None, None)])
-def test_column_is_a_number_or_a_name(text, column):
-    assert column_of(text) == column
 
 
 def test_a_model_is_exported(hilctl, json_of, tmp_path):

@@ -13,7 +13,6 @@ import pytest
 from hilctl import cli
 from hilctl.base.errors import InputError
 from hilctl.cli import output
-from hilctl.cli.console import console
 
 HOSTILE = "a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
 SHOWN = r"a\x1b]0;title\x07b\x9b2Jc\rd\x7fe\u202ef"
@@ -79,14 +78,6 @@ raise SystemExit(0 if opened > 2 else 1)
     assert in_a_process(code, closed).returncode == 0
 
 
-def test_streams_are_restored(capsys):
-    before = sys.stdout, sys.stderr
-    with output.safe_streams():
-        print(HOSTILE)
-    assert (sys.stdout, sys.stderr) == before
-    assert capsys.readouterr().out == SHOWN + "\n"
-
-
 def test_json_is_one_object_without_nan(capsys):
     output.print_json({"gain": 0.5, "names": ["a"]})
     assert json.loads(capsys.readouterr().out) == {"gain": 0.5, "names": ["a"]}
@@ -131,11 +122,6 @@ def test_quiet_prints_warnings_only(monkeypatch, hilctl, capsys):
     assert hilctl("--quiet", "--json")[1] == "a table\n"
     print("again")
     assert capsys.readouterr().out == "again\n"
-
-
-def test_quiet_hides_progress():
-    output.Verbosity.quiet = True
-    assert not console(stderr=True).is_terminal
 
 
 def refuses():

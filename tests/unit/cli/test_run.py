@@ -18,10 +18,9 @@ from hilctl.base.segments import Segment
 from hilctl.cli import run as module
 from hilctl.cli.output import Verbosity
 from hilctl.cli.reports import render_report
-from hilctl.cli.run import print_run, report_of, run_mapping, run_progress
+from hilctl.cli.run import print_run, run_progress
 from hilctl.run.result import RunResult
 from hilctl.run.safety.manual_safe import SafeResult
-from hilctl.run.start import Detached
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 ENDED = RunResult(Path("a.mcap"), "stopped", "hilctl stop", "confirmed", 15, 0, 3, 2)
@@ -67,31 +66,9 @@ def test_interrupted_report_keeps_the_result(started, hilctl, monkeypatch):
     assert (code, json.loads(out)["code"]) == (130, "completed")
 
 
-def test_require_rt_is_the_last_setting(started, json_of):
-    _, result = json_of("run", DEMO, "--require-rt", "--set", "block=25")
-    assert started[0] == [(DEMO, ["block=25", "realtime.require=true"], None, False, False)]
-    assert result["code"] == "completed"
-
-
-def test_a_device_of_another_user_is_taken_over_on_request_only(started, json_of, monkeypatch):
-    json_of("run", DEMO, "--take-over")
-    assert started[0][0][-1] is True
-    flags = []
-
-    def start_detached(experiment, settings, output, given):
-        flags.append(given)
-        return Detached(None, Path("a.mcap"), Path("a.log"))
-
-    monkeypatch.setattr(module, "start_detached", start_detached)
-    json_of("run", DEMO, "--detach", "--take-over", "--overwrite")
-    json_of("run", DEMO, "--detach")
-    assert flags == [["--overwrite", "--take-over"], []]
-
-
-def test_check_prints_the_forecast(json_of):
-    _, printed = json_of("check", DEMO, "--set", "waveform.duration_s=1.0")
-    assert printed["experiment"] == str(DEMO)
-    assert printed["samples"] == 50_000
+def test_options_reach_the_run(started, json_of):
+    json_of("run", DEMO, "--require-rt", "--take-over", "--set", "block=25")
+    assert started[0] == [(DEMO, ["block=25", "realtime.require=true"], None, False, True)]
 
 
 def test_check_lists_the_triggers(json_of, hilctl):
@@ -117,25 +94,11 @@ def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, hilctl, as_json):
     assert not as_json or json.loads(out)["output_safe"] is False
 
 
-def test_confirmed_safe_value_is_printed(monkeypatch, hilctl):
-    put = SafeResult("a device", 0.25, "A", "confirmed", "")
-    monkeypatch.setattr(module, "put_safe", lambda path, settings: put)
-    assert "0.25 A" in hilctl("safe", DEMO)[1]
-
-
 @pytest.mark.parametrize("words", [["--detach", "--live"], ["--watch", "--json"]])
 def test_incompatible_options_are_refused(hilctl, words):
     """The log of a background run must not contain the token of the page."""
     code, _, err = hilctl("run", DEMO, *words)
     assert (code, words[1] in err) == (2, True)
-
-
-def test_run_mapping():
-    assert run_mapping(ENDED, None) == {
-        "recorded_samples": 0, "dropped": 3, "output": "a.mcap", "code": "stopped",
-        "reason": "hilctl stop", "output_safe": True, "output_state": "confirmed",
-        "guardian_active": False, "deadline_misses": "", "adapted": {},
-    }  # fmt: skip
 
 
 def test_address_of_the_page_is_printed_with_the_first_samples(capsys):
@@ -144,10 +107,6 @@ def test_address_of_the_page_is_printed_with_the_first_samples(capsys):
         update(None)
         update(None)
         assert capsys.readouterr().err == "live page: http://127.0.0.1:5/#x\n"
-
-
-def test_run_without_samples_has_no_report():
-    assert report_of(ENDED, every=False) is None
 
 
 @pytest.mark.parametrize("safe", [True, False])
@@ -239,14 +198,6 @@ def test_simulated_and_incomplete_runs_are_marked(lagging):
     assert "no hardware" in terminal(summarize(simulated))
     assert "no hardware" not in terminal(summarize(lagging()))
     assert "NOT complete" in terminal(summarize(replace(lagging(), end={})))
-
-
-def test_names_are_not_markup(lagging):
-    parts = [segment(0, 2000, 1000.0, "[red]a[/red]"), segment(2000, 3000, 1000.0, "[b]")]
-    run = {"name": "[bold]name", "device": "[dac]"}
-    text = terminal(summarize(lagging(run=run, segments=parts)))
-    for shown in ("[bold]name", "[dac]", "[red]a[/red]", "[b]"):
-        assert shown in text
 
 
 def test_uncompensated_run_shows_no_errors(make_recording):

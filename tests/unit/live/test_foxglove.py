@@ -3,7 +3,6 @@
 import asyncio
 import base64
 import json
-import logging
 import re
 import struct
 import sys
@@ -148,13 +147,6 @@ def test_plotjuggler_layout_names_existing_fields():
         assert field in fields_of(f"/{topic}")
         assert f"/{topic}" in TOPICS  # the layout opens a recording too
     assert len(names) > 6
-
-
-def test_log_settings_are_restored():
-    root = logging.getLogger()
-    before = root.level, root.handlers[:]
-    FoxgloveServer(first, port=0).run(lambda server: True)
-    assert (root.level, root.handlers) == before
 
 
 def test_server_stops_with_clients_that_do_not_read(monkeypatch):

@@ -9,7 +9,6 @@ import socket
 import subprocess
 from contextlib import asynccontextmanager, suppress
 from pathlib import Path
-from types import SimpleNamespace
 from unittest.mock import Mock
 
 import pytest
@@ -17,7 +16,7 @@ from websockets.asyncio.client import connect
 from websockets.datastructures import Headers
 from websockets.exceptions import ConnectionClosed, InvalidStatus
 
-from hilctl.base.errors import InputError, RunError
+from hilctl.base.errors import InputError
 from hilctl.live import server as module
 from hilctl.live.server import (
     FILES,
@@ -103,45 +102,6 @@ def test_page_gets_frames_and_status(description, tmp_path):
     assert b'"signals": 6' in frame
 
 
-def test_stop_is_requested_and_acknowledged(description, tmp_path, monkeypatch):
-    stopped = []
-    monkeypatch.setattr(module, "request_stop", lambda run: stopped.append(run) or True)
-
-    async def pressed():
-        async with serving() as server, opened(server) as connection:
-            await status_of(connection)
-            return await answer_to(connection, ask="stop")
-
-    with active_run(description, tmp_path) as (folder, _):
-        assert asyncio.run(pressed())["ok"]
-        assert stopped == [folder]
-
-
-def test_requests_go_to_the_control_socket(description, tmp_path, monkeypatch):
-    asked = []
-
-    def ask(path, request, timeout_s):
-        asked.append((path, request))
-        if request["command"] == "set":
-            raise RunError("no room")
-        return {"sample": 5}
-
-    monkeypatch.setattr(module, "ask", ask)
-
-    async def answers():
-        async with serving() as server, opened(server) as connection:
-            await status_of(connection)
-            mark = {"command": "mark", "text": "tap"}
-            yes = await answer_to(connection, ask="run", request=mark)
-            return yes, await answer_to(connection, ask="run", request={"command": "set"})
-
-    with active_run(description, tmp_path) as (folder, _):
-        yes, no = asyncio.run(answers())
-        assert asked[0] == (folder.socket, {"command": "mark", "text": "tap"})
-    assert (yes["ok"], yes["sample"]) == (True, 5)
-    assert (no["ok"], no["error"]) == (False, "no room")
-
-
 @pytest.mark.slow
 def test_report_is_served_to_the_page_that_asked_for_it(description, tmp_path, monkeypatch):
     """It executes nothing of the working folder."""
@@ -202,16 +162,6 @@ def test_only_get_requests_of_files_are_served():
             return [(await http(server, line))[0] for line in lines]
 
     assert asyncio.run(answers()) == [200, 200, 403, 405, 405, 404]
-
-
-def test_requests_without_a_method_are_of_an_older_websockets_and_get():
-    server = LiveServer(first)
-    request = SimpleNamespace(path="/", headers=Headers(Host=f"127.0.0.1:{server.port}"))
-    try:
-        assert server._admit(Mock(), request).status_code == 200
-    finally:
-        for each in server._sockets:
-            each.close()
 
 
 def test_a_message_that_is_too_long_ends_its_connection_only():
@@ -335,10 +285,6 @@ def test_a_foreign_host_is_refused(host, upgrade):
 )
 def test_a_foreign_origin_is_refused(origin):
     assert refused(Host=HOST, Origin=origin, Sec_WebSocket_Protocol=OFFER) == 403
-
-
-def test_foreign_page_gets_no_file():
-    assert refused(upgrade=False, Host=HOST, Origin="http://evil.example") == 403
 
 
 WRONG = ("token.", f"token.{TOKEN[:-1]}", f"token.{TOKEN}0", f"token.{'0' * 32}, token.{TOKEN}")

@@ -1,34 +1,27 @@
 """The loop process, run in this one: what it does with a job, and what it imports."""
 
-import json
-import math
 import os
 import signal
 import sys
-import time
 from dataclasses import replace
-from functools import partial
 from pathlib import Path
-from types import SimpleNamespace
 
 import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError, RunError
-from hilctl.base.samples import BlockHeader, Flag
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
-from hilctl.loop.pacer import Lateness, LateRules
+from hilctl.loop.pacer import LateRules
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.loop.tuning import LinearBypass, Tuning
-from hilctl.machine.procfs import ProcessUsage
 from hilctl.machine.rt_setup import SetUpStep
 from hilctl.run import loop_process
 from hilctl.run.job import Job
 from hilctl.run.loop_process import RingHost
-from hilctl.run.run_folder import GUARDIAN, RunCard, RunFolder
+from hilctl.run.run_folder import RunCard, RunFolder
 from hilctl.run.shared import ring as ring_module
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, Stop
@@ -140,36 +133,8 @@ def test_a_start_that_is_refused_moves_nothing(broken, output):
     assert page.get(PageField.PHASE) == Phase.STARTING
 
 
-@pytest.mark.parametrize(("output", "ramps"), [(0.0, False), (5.0, True)])
-def test_the_waveform_begins_after_the_ramp(broken, output, ramps):
-    _, _, page = broken(output=output)
-    assert (page.get(PageField.WAVEFORM_AT) > 0) == ramps
-
-
 OUTCOME = LoopOutcome("completed", "waveform completed", 7, "confirmed", 0)
 REFUSED = (SetUpStep("fifo", "failed", "not permitted", "raise rtprio"),)
-
-
-def test_the_loop_is_started_at_the_time_that_the_supervisor_says(prepared):
-    made = prepared()
-    made.page.put(PageField.START_NS, 12345)
-    made.steps = REFUSED
-    seen = []
-
-    def run(loop, start_ns):
-        seen.append((start_ns, made.page.get(PageField.PHASE)))
-        loop.lateness.late_ticks, loop.lateness.worst_ns = 3, 70
-        return OUTCOME
-
-    made.loop_does(run)
-    assert made.run() == OUTCOME
-    assert seen == [(12345, Phase.RUNNING)]
-    assert made.page.get(PageField.PHASE) == Phase.CLOSING
-    assert made.device.events == ["prepare", "open", "close"]
-    assert made.page.lateness() == Lateness(late_ticks=3, worst_ns=70)
-    facts, refused = json.loads(made.page.read_text(PageSlot.SET_UP))
-    assert facts == {"rt.fifo": "failed: not permitted"}
-    assert refused == ["fifo: not permitted: raise rtprio"]
 
 
 @pytest.mark.parametrize("required", [False, True])
@@ -190,28 +155,6 @@ def test_real_time_that_is_required_is_refused_before_the_device_is_opened(prepa
 
 @pytest.mark.parametrize(("field", "done"), [
     (PageField.HAS_DEVICE, ["prepare"]),
-    (PageField.GO, ["prepare", "open"]),
-])  # fmt: skip
-def test_it_waits_for_the_device_and_the_start_signal(prepared, monkeypatch, field, done):
-    """A guardian may keep the device until the loop needs it."""
-    made, slept_s = prepared(), []
-    made.page.put(field, 0)
-    made.loop_does(lambda loop, start_ns: OUTCOME)
-
-    def sleep(seconds):
-        slept_s.append(seconds)
-        assert made.page.get(PageField.AWAITS_DEVICE)
-        assert made.device.events == done
-        made.page.put(field, len(slept_s) == 3)
-
-    monkeypatch.setattr(time, "sleep", sleep)
-    assert made.run() == OUTCOME
-    assert len(slept_s) == 3
-    assert max(slept_s) < 0.005
-
-
-@pytest.mark.parametrize(("field", "done"), [
-    (PageField.HAS_DEVICE, ["prepare"]),
     (PageField.GO, ["prepare", "open", "close"]),
 ])  # fmt: skip
 def test_if_the_supervisor_dies_before_the_start_nothing_moves(prepared, monkeypatch, field, done):
@@ -222,60 +165,6 @@ def test_if_the_supervisor_dies_before_the_start_nothing_moves(prepared, monkeyp
     with pytest.raises(RunError, match="nothing has moved"):
         made.run()
     assert made.device.events == done
-
-
-@pytest.fixture
-def orphaned(prepared, monkeypatch):
-    """A loop of a real device whose supervisor is dead; return the job, and words of a new program.
-
-    Its guardian gave its last heartbeat 2 s ago.
-    """
-    made, words = prepared(), []
-    made.job = replace(made.job, holds=["tcp:10.9.8.7"], supervisor=1 - os.getppid())
-    made.page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns() - 2 * 10**9)
-    made.job.write(made.folder.job)
-    monkeypatch.setattr(loop_process.signal, "signal", lambda *_: None)
-    monkeypatch.setattr(loop_process, "be_ordinary", lambda: None)
-    monkeypatch.setattr(loop_process, "keep_removed", lambda: None)
-    monkeypatch.setattr(loop_process.os, "execv", lambda program, given: words.append(given))
-    monkeypatch.setattr(loop_process.os, "dup2", lambda *_: None)
-    monkeypatch.setattr(loop_process, "_SILENCE_S", 0.05)
-    made.words = words
-
-    def ends(outcome):
-        monkeypatch.setattr(loop_process, "run_job", lambda job, ring: outcome)
-        loop_process.main([str(made.folder.job)])
-
-    made.ends = ends
-    return made
-
-
-def test_the_last_process_of_a_run_becomes_its_guardian(orphaned):
-    orphaned.ends(replace(OUTCOME, output="unknown"))
-    ((*_, module, job, how),) = orphaned.words
-    assert (module, job, how) == (GUARDIAN, str(orphaned.folder.job), "act")
-
-
-@pytest.mark.parametrize("why", ["safe", "guarded", "not started", "simulated"])
-def test_a_loop_ends_if_its_output_needs_no_guardian(orphaned, monkeypatch, why):
-    if why == "guarded":
-        beats = partial(orphaned.page.put, PageField.GUARDIAN_HEARTBEAT_NS)
-        monkeypatch.setattr(loop_process.time, "sleep", lambda s: beats(time.monotonic_ns()))
-    elif why == "not started":
-        orphaned.page.put(PageField.GO, 0)
-    elif why == "simulated":
-        replace(orphaned.job, holds=[]).write(orphaned.folder.job)
-    orphaned.ends(OUTCOME if why == "safe" else replace(OUTCOME, output="unknown"))
-    assert orphaned.words == []
-
-
-def test_it_leaves_what_the_run_took_of_the_machine(prepared, monkeypatch):
-    made, counts = prepared(), iter(((50, 7, 1, 1, 1), (60, 9, 3, 1, 4)))
-    usage = SimpleNamespace(now=lambda: ProcessUsage(*next(counts)))
-    monkeypatch.setattr(loop_process, "ProcessUsage", usage)
-    made.loop_does(lambda loop, start_ns: OUTCOME)
-    assert made.run() == OUTCOME
-    assert made.page.usage() == ProcessUsage(60, 9, 3, 1, 4).since(ProcessUsage(50, 7, 1, 1, 1))
 
 
 @pytest.mark.parametrize(("raised", "code", "phase", "text"), [
@@ -395,17 +284,6 @@ def test_a_tuning_waits_for_its_sample(host, ring):
     assert page.get(PageField.TUNE_TAKEN) == 1
 
 
-def test_closing_is_shown_before_the_device_takes_its_time(host, ring, clock):
-    host.closing()
-    assert ring.page.get(PageField.PHASE) == Phase.CLOSING
-    assert ring.page.get(PageField.LOOP_HEARTBEAT_NS) == clock.now
-
-
-def test_a_supervisor_may_be_silent_for_ever(ring, clock, monkeypatch):
-    monkeypatch.setattr("os.getppid", lambda: 77)
-    assert RingHost([ring], clock, 77, math.inf).heartbeat(0, 0) == ""
-
-
 class AskingDevice(FakeDevice):
     """Calls a function in the exchange of one sample, as a supervisor would act meanwhile."""
 
@@ -479,42 +357,3 @@ def test_a_slot_that_is_used_again_has_nothing_of_its_last_block(tmp_path, monke
     monkeypatch.setattr(ring_module, "_MOST_BLOCKS", 0)
     assert reused == recorded(tmp_path / "anew")
     assert reused[0].code == "completed"
-
-
-@pytest.mark.parametrize(
-    ("field", "number"),
-    [(PageField.STOP, Stop.REQUEST), (PageField.SUPERVISOR_HEARTBEAT_NS, -(10**10))],
-)
-def test_what_is_asked_holds_from_the_next_tick_on(tmp_path, field, number):
-    rig = Rig(tmp_path / "ring", at=42, act=lambda _: rig.ring.page.put(field, number))
-    assert rig.run().code == "stopped"
-    assert rig.flags(43) & Flag.RAMP
-    assert not rig.flags(42) & Flag.RAMP
-
-
-def test_a_block_on_its_way_can_be_seen_as_such(tmp_path):
-    seen = []
-
-    def look(command):
-        batch, page = rig.ring.unanswered(20), rig.ring.page
-        sent = batch.heads[0, BlockHeader.FIRST_SAMPLE], batch.columns[0, 2, 0]
-        names = ("SENT", "HEAD", "ENDED_AT", "EXCHANGING", "NEXT_SAMPLE")
-        seen.append((sent[0], [page.get(PageField[name]) for name in names]))
-        assert sent[1] == command
-
-    rig = Rig(tmp_path / "ring", at=20, act=look)
-    rig.run()
-    assert seen == [(20, [21, 20, 21, 1, 20])]
-
-
-def test_a_tick_shows_how_many_were_late(tmp_path):
-    page = []
-    fields = (PageField.LATE_TICKS, PageField.NEXT_SAMPLE, PageField.LOOP_HEARTBEAT_NS)
-
-    def look(command):
-        page.extend(rig.ring.page.get(field) for field in fields)
-
-    rig = Rig(tmp_path / "ring", at=20, act=look, stalls={5: 600_000})
-    rig.run()
-    assert page[:2] == [1, 20]
-    assert page[2] >= 21_000_000

@@ -49,20 +49,6 @@ def never():
     return False
 
 
-def test_the_job_is_given_with_the_locks(started):
-    process = started[0]._process
-    assert process.words == ("hilctl.run.loop_process", "job")
-    assert process.inherits == (5, 6)
-
-
-def test_a_loop_process_that_cannot_be_started_is_an_error_of_the_run(tmp_path, monkeypatch):
-    monkeypatch.setattr(
-        module, "start_process", Mock(side_effect=OSError(24, "Too many open files"))
-    )
-    with pytest.raises(RunError, match="Too many open files"):
-        LoopProcess(SimpleNamespace(job=Path("job")), None, ())
-
-
 @pytest.mark.parametrize(
     ("phase", "error"), [(Phase.REFUSED, InputError), (Phase.FAILED, RunError)]
 )
@@ -79,14 +65,6 @@ def test_a_loop_that_died_before_the_start_is_told_by_its_signal(started):
     child._process.code = -signal.SIGKILL
     with pytest.raises(RunError, match="died before the start: killed by SIGKILL"):
         child.await_ready(never)
-
-
-def test_a_stop_comes_before_the_start(started):
-    child, page = started
-    with pytest.raises(RunError, match="stopped before the start; nothing has moved"):
-        child.await_ready(lambda: True)
-    page.put(PageField.PHASE, Phase.READY)
-    child.await_ready(lambda: True)
 
 
 def test_the_device_is_acquired_when_the_loop_needs_it(started):
@@ -176,13 +154,6 @@ def test_a_guardian_that_keeps_its_device_is_not_waited_for_without_end(left, sl
             relief.acquire(locks, Mock(side_effect=RunError("stopped")))
 
 
-def test_a_free_device_is_acquired_without_a_claim(left):
-    _, page = left()
-    with DeviceLocks([HOLDS]) as locks:
-        GuardianRelief([HOLDS]).acquire(locks)
-    assert page.get(PageField.CLAIM) == 0
-
-
 def test_relieved_runs_stay_for_samples_that_are_not_recorded(left):
     (_, page), (missing, other) = left(), left(recorded=False)
     relief = GuardianRelief([HOLDS])
@@ -234,12 +205,3 @@ def test_dead_guardians_are_started_again_with_the_lock_of_their_run(left, monke
     for each in locks:
         os.close(each)
     assert not dead.alive
-
-
-@pytest.mark.parametrize(("own", "expected"), [({}, "1"), ({"OPENBLAS_NUM_THREADS": "3"}, "3")])
-def test_a_process_of_a_run_has_one_blas_thread_unless_set(monkeypatch, own, expected):
-    monkeypatch.setattr(module.os, "environ", {"HOME": "/home"} | own)
-    popen = Mock()
-    monkeypatch.setattr(module.subprocess, "Popen", popen)
-    module.start_process("some.module", inherits=())
-    assert popen.call_args.kwargs["env"] == {"HOME": "/home", "OPENBLAS_NUM_THREADS": expected}

@@ -172,13 +172,6 @@ def test_a_dead_run_is_forgotten_once_its_output_is_settled(orphan, settle):
     assert runs() == []
 
 
-def test_a_dead_run_of_a_simulated_device_is_removed(dead):
-    dead(unsafe)
-    (recovered,) = recover_dead_runs()
-    assert not recovered.safe
-    assert runs() == []
-
-
 def test_a_living_run_is_left_alone(tmp_path):
     with run_folder("sine", tmp_path / "a.mcap", 12.0) as (folder, _):
         assert recover_dead_runs() == []

@@ -1,7 +1,6 @@
 """Names of recordings and logs, and runs of programs that have threads."""
 
 import signal
-import threading
 import time
 from dataclasses import replace
 from pathlib import Path
@@ -18,7 +17,6 @@ from hilctl.run.start import (
     checked_experiment,
     completed_key,
     default_output,
-    has_threads,
     output_of,
     run_in_own_process,
     unpaced,
@@ -88,14 +86,6 @@ def test_what_was_not_completed_has_no_key(experiment, tmp_path):
     assert completed_key(tmp_path / "absent.mcap") is None
 
 
-def test_a_model_counts(experiment):
-    loaded = load_experiment(experiment)
-    key = RunKey.of(loaded)
-    assert (key.model, key.correction) == ("", "")
-    facts = {"experiment_sha256": key.experiment, "model_sha256": "x"}
-    assert RunKey.of_facts(facts) == RunKey(key.experiment, "x", "")
-
-
 def test_a_recording_says_the_coil_s_heat_before_and_after(experiment, tmp_path):
     first = read(unpaced(experiment, BUDGET, tmp_path / "a.mcap").path)
     left = float(first.end["coil_heat_a2"])
@@ -126,18 +116,6 @@ def answering(monkeypatch):
         monkeypatch.setattr(start, "_START", f"{first}\n{code}")
 
     return says
-
-
-def in_a_thread(function):
-    found = []
-    thread = threading.Thread(target=lambda: found.append(function()))
-    thread.start()
-    thread.join()
-    return found[0]
-
-
-def test_threads_are_seen():
-    assert in_a_thread(has_threads)
 
 
 def test_errors_come_back_as_they_are(answering):
@@ -181,12 +159,3 @@ def test_display_that_fails_ends_no_run(answering):
     with pytest.raises(InputError, match="done"):
         run_in_own_process(GIVEN, show)
     assert shown == [0]
-
-
-def test_the_thread_of_the_reserve_is_no_reason_for_another_process(monkeypatch):
-    main, reserve, other = threading.main_thread(), threading.Thread(), threading.Thread()
-    monkeypatch.setattr(start.RESERVE, "thread", reserve)
-    monkeypatch.setattr(threading, "current_thread", lambda: main)
-    for others, expected in (((), False), ((reserve,), False), ((reserve, other), True)):
-        monkeypatch.setattr(threading, "enumerate", lambda others=others: [main, *others])
-        assert has_threads() == expected

@@ -14,7 +14,6 @@ from hilctl.analysis.export import columns, export_all
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
-from hilctl.base.events import Event
 from hilctl.base.samples import BlockHeader, Flag
 from hilctl.recording import writer
 from hilctl.recording.metadata_keys import END_FIGURES
@@ -22,7 +21,7 @@ from hilctl.recording.reader import read
 from hilctl.recording.writer import PendingFile
 from hilctl.run.assemble import assemble
 from hilctl.run.start import checked_experiment
-from hilctl.run.unpaced import OfflineLane, VirtualClock, run_in_memory, run_unpaced
+from hilctl.run.unpaced import OfflineLane, run_in_memory, run_unpaced
 from tests.fakes import FailingFile
 
 UNCOMPENSATED = Path(__file__).parents[3] / "configs" / "terfenol_sine_6a_uncompensated.yaml"
@@ -33,13 +32,6 @@ def plan(block, latency_blocks):
     compensator, interlocks = SimpleNamespace(state_size=0), SimpleNamespace(aux=())
     axis = SimpleNamespace(compensator=compensator, interlocks=interlocks)
     return SimpleNamespace(block=block, latency_blocks=latency_blocks), axis
-
-
-def test_time_passes_in_sleeps_only():
-    clock = VirtualClock()
-    clock.sleep_until_ns(500)
-    clock.sleep_until_ns(200)
-    assert clock.now_ns() == 500
 
 
 @pytest.mark.parametrize(("pending_bytes", "writes_before"), [(0, 12), (1 << 20, 1)])
@@ -115,26 +107,6 @@ def test_every_block_comes_once_and_in_order(latency):
     lane.flush()
     assert firsts == [2 * number for number in range(1000)]
     assert seen == list(range(1000))
-
-
-def test_an_event_comes_after_the_blocks_before_it():
-    order = []
-    lane = OfflineLane(
-        *plan(1, 0), on_batch=lambda batch: order.append(len(batch.heads)),
-        on_event=lambda event: order.append(event.code),
-    )  # fmt: skip
-    lane.answered(lane.claim())
-    lane.record_event(Event(1, "info", "tuned", "x"))
-    assert order == [1, "tuned"]
-
-
-def test_a_whole_run_is_recorded_and_says_that_it_was_not_paced(tmp_path):
-    checked = checked_experiment(UNCOMPENSATED, SHORT)
-    result = run_unpaced(checked, tmp_path / "run.mcap")
-    recording = read(result.path)
-    assert (result.code, result.safe, result.missing) == ("completed", True, 0)
-    assert np.array_equal(recording.samples.index, np.arange(result.samples))
-    assert '"paced": "false"' in str(recording.run) or recording.run.get("paced") == "false"
 
 
 @pytest.mark.parametrize("output", [7.0, -9.5])

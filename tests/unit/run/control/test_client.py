@@ -1,7 +1,6 @@
 """Runs from outside: selection of a run, requests to it, and the signal that stops it."""
 
 import os
-import signal
 import socket
 import subprocess
 import sys
@@ -16,14 +15,11 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.run.control import client
 from hilctl.run.control.client import (
     STOP_SIGNAL,
-    active_runs,
     ask,
     assigned,
     find_run,
     finish_dead_runs,
-    mark_run,
     request_stop,
-    set_run,
     status_of,
     stop_runs,
 )
@@ -116,25 +112,6 @@ def test_all_runs_are_requested_to_stop_before_one_is_waited_for(answers, monkey
         ("d", True, ""),
     ]
     assert answers == []
-
-
-def test_only_runs_with_a_supervisor_are_going_on(monkeypatch):
-    found = [run("a"), run("b", supervised=False)]
-    monkeypatch.setattr(client, "runs", lambda: found)
-    assert active_runs() == found[:1]
-
-
-def test_set_sends_what_is_to_change(answers):
-    set_run(run("a"), **assigned(["gain=0.5", "offset=-2"]), over_s=1.5)
-    set_run(run("a"), **assigned(["inverse=out"]))
-    first, second = answers
-    assert first == ("a.sock", {"command": "set", "gain": 0.5, "offset": -2.0, "over_s": 1.5})
-    assert second == ("a.sock", {"command": "set", "inverse": "out", "over_s": 1.0})
-
-
-def test_mark_sends_its_text(answers):
-    mark_run(run("a"), "tapped the stage")
-    assert answers == [("a.sock", {"command": "mark", "text": "tapped the stage"})]
 
 
 @pytest.mark.parametrize(("text", "said"), [
@@ -244,14 +221,6 @@ def test_a_supervisor_that_is_gone_is_no_error(process):
     assert not request_stop(run_of(process.pid))
 
 
-def test_what_the_kernel_refuses_is_told(process, monkeypatch):
-    monkeypatch.setattr(
-        signal, "pidfd_send_signal", Mock(side_effect=PermissionError(1, "Operation not permitted"))
-    )
-    with pytest.raises(RunError, match="a: can't be stopped: Operation not permitted"):
-        request_stop(run_of(process.pid))
-
-
 @pytest.fixture
 def recovered(monkeypatch):
     """Return a function that finishes the dead ones of runs, each of which becomes a result."""
@@ -276,10 +245,3 @@ def test_what_was_done_is_logged(recovered, caplog):
         "sine-7 was not recorded to its end: supervisor and loop died",
         "recovered into a.mcap",
     ]
-
-
-def test_a_run_that_never_started_is_one_line(recovered, caplog):
-    recovered(
-        RecoveredRun("sine-7", Path("a.mcap"), True, "nothing has moved", started=False), DEAD
-    )
-    assert len(caplog.messages) == 1

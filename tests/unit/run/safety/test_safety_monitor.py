@@ -247,24 +247,6 @@ def test_run_ends_if_no_process_can_act(run, monkeypatch, how):
     assert not run.safety.close()
 
 
-def test_if_no_process_can_act_the_run_ends(unconfirmed, monkeypatch):
-    monkeypatch.setattr(module, "_HAND_OVER_S", 0.0)
-    monkeypatch.setattr(module, "_REPEAT_NS", 0)
-    unconfirmed.guardians[-1].ended = True
-    unconfirmed.fail_start, unconfirmed.error = OSError(24, "Too many open files"), MemoryError()
-    assert not unconfirmed.safety.close()
-    assert unconfirmed.safety.result.output == "unknown"
-
-
-def test_a_simulated_device_has_no_guardian(ring, monkeypatch):
-    run = Run(ring, monkeypatch, guarded=False, simulated=True)
-    assert run.safety.ready()
-    run.look()
-    run.look(ended=True)
-    assert run.settle().confirmed
-    assert run.log == ["loop killed", "safe 0.25"]
-
-
 def test_a_loop_that_said_how_it_ended_is_left_alone(run, page):
     page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed", 0))
     run.guardians[0].ended = True  # as it does by itself

@@ -1,7 +1,5 @@
 """The ring between loop and recorder."""
 
-from pathlib import Path
-
 import numpy as np
 import pytest
 from hypothesis import example, given, settings
@@ -62,26 +60,6 @@ def test_full_ring_refuses_and_keeps_what_it_has(tmp_path):
     assert push(ring, 9)
 
 
-def mapped(ring):
-    """Return the bytes of a ring's file that this process has mapped, in all of its mappings."""
-    resident, ours = 0, False
-    for line in Path("/proc/self/smaps").read_text(encoding="utf-8").splitlines():
-        words = line.split(maxsplit=5)
-        if not words[0].endswith(":"):
-            ours = words[-1] == str(ring.path)
-        elif ours and words[0] == "Rss:":
-            resident += int(words[1]) << 10
-    return resident
-
-
-def test_a_loop_has_all_of_it_mapped_before_its_first_tick(tmp_path):
-    """Where memory can't be locked, a block would be the first to touch its pages."""
-    size = make(tmp_path, slots=1000).path.stat().st_size
-    assert mapped(SampleRing(tmp_path / "ring")) < size
-    whole = SampleRing(tmp_path / "ring", at_once=True)
-    assert mapped(whole) >= size
-
-
 def test_many_come_out_some_at_a_time(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_BATCH_SAMPLES", 2 * BLOCK)
     ring = make(tmp_path, slots=7)
@@ -101,14 +79,6 @@ def test_many_come_out_some_at_a_time(tmp_path, monkeypatch):
     assert (sizes, taken) == ([2, 2, 2], [*range(3, 9)])
     assert [batch.heads.shape[0] for batch in other.batches()] == [1]
     assert not [*other.batches()]
-
-
-def test_a_block_comes_out_however_large_it_is(tmp_path, monkeypatch):
-    monkeypatch.setattr(module, "_BATCH_SAMPLES", 1)
-    ring = make(tmp_path)
-    push(ring, 0)
-    push(ring, 1)
-    assert ring.pop().heads.shape[0] == 1
 
 
 @settings(max_examples=50)
