@@ -3,7 +3,9 @@
 import os
 import signal
 import sys
+import time
 from dataclasses import replace
+from functools import partial
 from pathlib import Path
 
 import numpy as np
@@ -165,6 +167,45 @@ def test_if_the_supervisor_dies_before_the_start_nothing_moves(prepared, monkeyp
     with pytest.raises(RunError, match="nothing has moved"):
         made.run()
     assert made.device.events == done
+
+
+@pytest.fixture
+def orphaned(prepared, monkeypatch):
+    """A loop of a real device whose supervisor is dead; return the job, and words of a new program.
+
+    Its guardian gave its last heartbeat 2 s ago.
+    """
+    made, words = prepared(), []
+    made.job = replace(made.job, holds=["tcp:10.9.8.7"], supervisor=1 - os.getppid())
+    made.page.put(PageField.GUARDIAN_HEARTBEAT_NS, time.monotonic_ns() - 2 * 10**9)
+    made.job.write(made.folder.job)
+    monkeypatch.setattr(loop_process.signal, "signal", lambda *_: None)
+    monkeypatch.setattr(loop_process, "be_ordinary", lambda: None)
+    monkeypatch.setattr(loop_process, "keep_removed", lambda: None)
+    monkeypatch.setattr(loop_process.os, "execv", lambda program, given: words.append(given))
+    monkeypatch.setattr(loop_process.os, "dup2", lambda *_: None)
+    monkeypatch.setattr(loop_process, "_SILENCE_S", 0.05)
+    made.words = words
+
+    def ends(outcome):
+        monkeypatch.setattr(loop_process, "run_job", lambda job, ring: outcome)
+        loop_process.main([str(made.folder.job)])
+
+    made.ends = ends
+    return made
+
+
+@pytest.mark.parametrize("why", ["safe", "guarded", "not started", "simulated"])
+def test_a_loop_ends_if_its_output_needs_no_guardian(orphaned, monkeypatch, why):
+    if why == "guarded":
+        beats = partial(orphaned.page.put, PageField.GUARDIAN_HEARTBEAT_NS)
+        monkeypatch.setattr(loop_process.time, "sleep", lambda s: beats(time.monotonic_ns()))
+    elif why == "not started":
+        orphaned.page.put(PageField.GO, 0)
+    elif why == "simulated":
+        replace(orphaned.job, holds=[]).write(orphaned.folder.job)
+    orphaned.ends(OUTCOME if why == "safe" else replace(OUTCOME, output="unknown"))
+    assert orphaned.words == []
 
 
 @pytest.mark.parametrize(("raised", "code", "phase", "text"), [
