@@ -14,12 +14,7 @@ from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
-<<<<<<< HEAD:tests/unit/drivers/board/test_board_dac.py
-from hilctl_drivers.board.board_dac import exchange_time
-=======
-from hilctl.loop.plan import LoopPlan
 from hilctl_drivers.board.board_session import exchange_time
->>>>>>> 71b15354 (drivers: make a device of a wire, a watchdog and readers):tests/unit/drivers/board/test_board_wire.py
 from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from hilctl_drivers.transport.framing import binary_framing
