@@ -29,7 +29,7 @@ _SKIPPED, _CONDITION = int(Flag.AFTER_SKIPPED), int(Flag.CONDITION)
 _LOST = (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
 
 
-class Chain:
+class AxisChain:
     """One axis: compensator, limiter, device, interlocks, and what it learns.
 
     Args:

@@ -18,7 +18,7 @@ from hilctl.base.device import Device, DigitalDevice, WatchdogDevice
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import OFFSET, TRIGGERED, Event
 from hilctl.base.samples import Flag
-from hilctl.loop.chain import Chain
+from hilctl.loop.chain import AxisChain
 from hilctl.loop.pacer import Lateness, Pacer
 from hilctl.loop.plan import Host, LoopPlan
 from hilctl.loop.safe_output import (
@@ -58,7 +58,7 @@ class Loop:
         self._host = host
         self._clock = host.clock
         self._chains = [
-            Chain(
+            AxisChain(
                 axis, device, lane, sample_rate_hz=plan.sample_rate_hz, block=plan.block,
                 latency_blocks=plan.latency_blocks,
             )

@@ -20,6 +20,7 @@ WITHOUT = {
     "drivers/contract": "the checks of tests/contract; test_bad_devices.py makes each of them fail",
     "experiment/recording_settings": "keys: experiment/test_file.py; size: run/test_unpaced.py",
     "loop/plan": "two records of plain values; loop/test_loop.py fills and reads all of them",
+    "run/result": "records of plain values; unit/run/test_unpaced.py reads them",
     "recording/metadata_keys": "names; analysis/test_catalogue.py reads all of them",
     "recording/recording": "records of plain values; recording/test_reader.py fills them",
 }
