@@ -339,10 +339,20 @@ def _parts_of(first: Recording, model: HysteresisModel | None) -> tuple[Compensa
     if config.sample_rate_hz != first.sample_rate_hz:
         rates = f"{first.sample_rate_hz:g} Hz, its experiment is at {config.sample_rate_hz:g}"
         raise DataError(f"{first.path}: was recorded at {rates} Hz")
-    if model is None and first.compensated:
-        model = parse_model(f"{first.path}: model.yaml", first.model_yaml)
     limiter = Limiter(config.command_limits(), 1.0 / first.sample_rate_hz)
+    if model is None and first.compensated:
+        return _recorded_compensator(first), limiter
     return Compensator(model, first.sample_rate_hz), limiter
+
+
+def _recorded_compensator(first: Recording) -> Compensator:
+    """Return the recorded compensator, of the version whose memory has the recorded size."""
+    model = parse_model(f"{first.path}: model.yaml", first.model_yaml)
+    made = Compensator(model, first.sample_rate_hz)
+    if first.starts and first.starts[0].state.size != made.state_size:
+        before = model.earlier()
+        return made if before is None else Compensator(before, first.sample_rate_hz)
+    return made
 
 
 def _alike(flags: U32, rows: slice) -> list[slice]:

@@ -10,6 +10,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    PrivateAttr,
     StringConstraints,
     ValidationError,
     ValidationInfo,
@@ -20,9 +21,9 @@ from pydantic import (
 from pydantic_core import ErrorDetails
 
 __all__ = [
-    "HALF_CHARACTER", "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "StrictModel",
-    "StringConstraints", "ValidationError", "ValidationInfo", "WithJsonSchema", "field_validator",
-    "first_problem", "model_validator", "without_halves",
+    "HALF_CHARACTER", "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "PrivateAttr",
+    "StrictModel", "StringConstraints", "ValidationError", "ValidationInfo", "WithJsonSchema",
+    "field_validator", "first_problem", "model_validator", "without_halves",
 ]  # fmt: skip
 
 

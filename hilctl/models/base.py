@@ -219,6 +219,10 @@ class HysteresisModel(CheckedModel, ABC):
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest; raise ModelError if there is none."""
 
+    def earlier(self) -> "HysteresisModel | None":
+        """Return the model with its inverse of an earlier version, for replays; None if equal."""
+        return None
+
     @property
     @abstractmethod
     def operators(self) -> int:

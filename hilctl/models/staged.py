@@ -19,7 +19,7 @@ from typing import Annotated, Any, Literal, Self, TypeVar
 
 import numpy as np
 
-from hilctl.base.strict import Field, StrictModel
+from hilctl.base.strict import Field, PrivateAttr, StrictModel
 from hilctl.kernels.dynamics import lag_block, lead_block, weigh_block
 from hilctl.models.base import HysteresisModel, Operator, Provenance
 from hilctl.models.effective_field import FieldModel
@@ -100,6 +100,7 @@ class StagedModel(HysteresisModel):
     delay_s: float = Field(default=0.0, ge=0.0, le=1.0)
     smoothing_s: float = Field(default=0.0, ge=0.0, le=0.1)
     creep: CreepModel | None = None
+    _excites_structure: bool = PrivateAttr(default=False)
 
     @classmethod
     def around(cls, hysteresis: AnyHysteresis, **stages: Any) -> Self:
@@ -156,6 +157,14 @@ class StagedModel(HysteresisModel):
             stages.append(self.lag.inverse(sample_rate_hz))
         return Chain(stages, preview=preview, input_offset=-self.output_offset_um)
 
+    def earlier(self) -> Self | None:
+        """Return the model with the inverse of 0.2.0, whose corners excite the structure."""
+        if self.structure is None:
+            return None
+        made = self.model_copy()
+        made._excites_structure = True  # noqa: SLF001  of its own class
+        return made
+
     def _unstructure(self, sample_rate_hz: float) -> Operator:
         """Return the inverse of the structure from derivatives of a smoothed displacement.
 
@@ -168,9 +177,13 @@ class StagedModel(HysteresisModel):
             weights, ahead = smoothing_weights(width)
         else:
             radian = structure.radian_s * sample_rate_hz
-            smoothing, ahead = smoothing_weights(max(width, radian))
-            undoing, one = smoothing_weights(0.0, 2.0 * structure.damping_ratio * radian, radian**2)
-            weights, ahead = np.convolve(smoothing, undoing), ahead + one
+            width, gains = max(width, radian), (2.0 * structure.damping_ratio * radian, radian**2)
+            if self._excites_structure:
+                weights, ahead = smoothing_weights(width, *gains)
+            else:
+                smoothing, ahead = smoothing_weights(width)
+                undoing, one = smoothing_weights(0.0, *gains)
+                weights, ahead = np.convolve(smoothing, undoing), ahead + one
         inverse = Operator(weigh_block, (weights,), weights.size - 1)
         inverse.preview = ahead
         return inverse
