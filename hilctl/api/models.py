@@ -15,12 +15,12 @@ from hilctl.experiment.load import inputs_of
 from hilctl.lab.comparison import compare as library
 from hilctl.lab.comparison.compare import Comparison
 from hilctl.lab.identify.data.data_files import load_records
-from hilctl.lab.identify.fit_api import FitRequest
+from hilctl.lab.identify.fit_api import FitRequest, OnProgress
 from hilctl.lab.identify.model_selection import choose_lag
-from hilctl.lab.identify.parallel import workers
+from hilctl.lab.identify.parallel import MapFunction, workers
 from hilctl.lab.identify.pipeline import Identification, identify_records, settings_from
-from hilctl.lab.identify.refine.acceptance import TOLERANCE_PERCENT
-from hilctl.lab.identify.refine.refinement import Refinement, load_runs, refine_runs
+from hilctl.lab.identify.refinement import Refinement, refine_records
+from hilctl.lab.identify.settings import IdentifySettings
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator
 from hilctl.models.model_export import check_rate, export_text
 from hilctl.models.model_file import dump_model
@@ -68,18 +68,32 @@ def identify(
             lag = choose_lag(
                 lambda lag: load_records(paths, chosen, lag).records, chosen, run, on_progress
             )
-        loaded, unit = load_records(paths, chosen, lag), chosen.table.unit
-        if loaded.unit and unit and loaded.unit != unit:
-            raise InputError(f"--unit must be {loaded.unit}, that of the files: {unit}")
-        held_out = load_records(others, chosen.model_copy(update={"leave_out": ()}), lag).records
-        request = FitRequest(
-            loaded.records, chosen, chosen.unit(loaded.unit), [path.name for path in paths],
-            run, on_progress, validate=held_out,
-        )  # fmt: skip
+        request, understood = _request(paths, others, chosen, lag, run, on_progress)
         found = identify_records(request)
     if output is not None and found.verdict.grade != "not a model":
         write_text(Path(output), dump_model(found.fit.model), overwrite=overwrite)
-    return replace(found, lag_samples=lag, understood=tuple(loaded.understood))
+    return replace(found, lag_samples=lag, understood=understood)
+
+
+def _request(
+    paths: Sequence[Path],
+    validate: Sequence[Path],
+    settings: IdentifySettings,
+    lag_samples: int,
+    run: MapFunction,
+    on_progress: OnProgress,
+) -> tuple[FitRequest, tuple[str, ...]]:
+    """Return a fit to files, and how their tables were read."""
+    loaded, unit = load_records(paths, settings, lag_samples), settings.table.unit
+    if loaded.unit and unit and loaded.unit != unit:
+        raise InputError(f"--unit must be {loaded.unit}, that of the files: {unit}")
+    every = settings.model_copy(update={"leave_out": ()})
+    held_out = load_records(validate, every, lag_samples).records
+    request = FitRequest(
+        loaded.records, settings, settings.unit(loaded.unit), [path.name for path in paths],
+        run, on_progress, validate=held_out,
+    )  # fmt: skip
+    return request, tuple(loaded.understood)
 
 
 @shown_briefly
@@ -180,18 +194,18 @@ def refine(
     output: PathLike | None = None,
     *,
     validate: Paths = (),
-    tolerance_percent: float = TOLERANCE_PERCENT,
     overwrite: bool = False,
     on_progress: Callable[[float, str], None] = lambda done, text: None,
 ) -> Refinement:
-    """Improve a model from recordings of runs; the file is written only if the model is better.
+    """Identify a model from recordings of runs; the file is written only if the model is better.
+
+    The new model is that of :func:`identify` with ``whole=true``; the old one is only compared.
 
     Args:
         model: Model file.
         runs: Recordings of compensated, learned or plain runs.
         output: Model file to write, if any.
-        validate: Recordings to validate the model with; default: each run in turn.
-        tolerance_percent: Increase of a run's rms error to accept, in percent of its peak-to-peak.
+        validate: Recordings to compare both models on; default: parts of the runs.
         overwrite: Replace an existing model file.
         on_progress: Called with the fraction done (0 to 1) and the current step.
 
@@ -201,12 +215,10 @@ def refine(
     file, paths, others = Path(model), paths_of(runs), paths_of(validate)
     if output is not None:
         check_writable(Path(output), overwrite=overwrite, inputs=[file, *paths, *others])
-    old = read_model(file)
-    on_progress(0.0, "reading")
-    both = load_runs([*paths, *others], old)
-    found = refine_runs(
-        old, both[: len(paths)], both[len(paths) :], file.name, on_progress, tolerance_percent
-    )
+    old, settings = read_model(file), settings_from("auto", ["whole=true"])
+    with workers("threads") as run:
+        request, _ = _request(paths, others, settings, 0, run, on_progress)
+        found = refine_records(old, request)
     if output is not None and found.better:
         write_text(Path(output), dump_model(found.model), overwrite=overwrite)
     return found

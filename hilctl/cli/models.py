@@ -25,17 +25,15 @@ from hilctl.cli.output import print_result
 from hilctl.lab.comparison.compare import Comparison, headings, notes, table_rows
 from hilctl.lab.identify.model_selection import OrderScore
 from hilctl.lab.identify.pipeline import Identification
-from hilctl.lab.identify.refine.acceptance import TOLERANCE_PERCENT
-from hilctl.lab.identify.refine.refinement import Refinement
+from hilctl.lab.identify.refinement import Refinement
 from hilctl.lab.identify.registry import CATALOGUE
 from hilctl.lab.identify.settings import setting_rows
 from hilctl.lab.identify.summary import (
-    class_table,
+    change_tables,
     loop_table,
     parameter_texts,
-    refinement_table,
+    refinement_lines,
     summary,
-    worse_lines,
 )
 from hilctl.run.control.client import finish_dead_runs
 
@@ -214,10 +212,6 @@ def refine(
     ],
     output: ModelFile = None,
     validate: Validate = None,
-    tolerance_percent: Annotated[
-        float,
-        typer.Option(help="Increase of a run's rms error to accept, percent of its peak-to-peak."),
-    ] = TOLERANCE_PERCENT,
     html: HtmlPage = None,
     overwrite: Overwrite = False,
     as_json: AsJson = False,
@@ -232,7 +226,6 @@ def refine(
             runs,
             output,
             validate=validate or [],
-            tolerance_percent=tolerance_percent,
             overwrite=overwrite,
             on_progress=progress,
         )
@@ -248,15 +241,11 @@ def refine(
 
 
 def print_refinement(result: Refinement, output: Path | None) -> None:
-    """Print the validation errors of the old and the new model."""
-    print(result)
-    for line in worse_lines(result):
+    """Print the errors of the old and the new model on held-out data."""
+    for line in refinement_lines(result):
         print(line)
-    title = f"validation: {result.choice.after.how}"
-    print_rich(table(title, *refinement_table(result)))
-    print_rich(table("by stroke", *class_table(result)))
-    if result.choice.own:
-        print("offset, creep and drift of single runs were not learned")
+    by_run, by_stroke = change_tables(result)
+    print_rich(table(f"validation: {result.held_out.how}", *by_run), table("by stroke", *by_stroke))
     if output is not None:
         print(f"model: {output}" if result.better else f"{output}: not written")
 

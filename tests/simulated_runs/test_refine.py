@@ -38,26 +38,18 @@ def test_compensated_runs_make_a_model_better_on_another_reference(tmp_path):
         summarize(read(run(tmp_path / f"{name}.mcap", model, 90.0, 28.0, seed=40)))
         for name, model in (("was", STAGED), ("now", better))
     )
-    assert now.peak_error_percent < 0.6 * was.peak_error_percent
+    assert now.peak_error_percent < 0.3 * was.peak_error_percent
     assert replay(read(tmp_path / "now.mcap")).identical
 
 
 def test_model_of_full_strokes_improves_on_small_references(tmp_path):
-    given = (
-        (10.0, 40.0), (60.0, 36.0), (150.0, 34.0), (20.0, 20.0), (100.0, 18.0), (40.0, 10.0),
-        (200.0, 9.0), (30.0, 4.0), (120.0, 4.0),
-    )  # fmt: skip
+    given = ((60.0, 38.0), (150.0, 34.0), (100.0, 18.0), (40.0, 10.0), (120.0, 4.0))
     runs = [
         run(tmp_path / f"{i}.mcap", OMEGA, *reference, seed=10 + i, strain=1.0)
         for i, reference in enumerate(given)
     ]
     better = tmp_path / "better.yaml"
-    refused = api.refine(OMEGA, runs, better)
-    assert refused.worse  # a full stroke, whose peak rises
-    assert not refused.better
-    assert not better.exists()
-    found = api.refine(OMEGA, runs, better, tolerance_percent=0.5)
-    assert found.better
+    assert api.refine(OMEGA, runs, better).better
 
     unseen = ((110.0, 36.0), (15.0, 19.0), (90.0, 9.0), (50.0, 4.0))
     was, now = (
@@ -69,5 +61,4 @@ def test_model_of_full_strokes_improves_on_small_references(tmp_path):
         ]
         for model in (OMEGA, better)
     )
-    assert max(now) < 0.6 * max(was)
-    assert all(after < before + 0.3 for before, after in zip(was, now, strict=True))
+    assert all(after < 0.5 * before for before, after in zip(was, now, strict=True))

@@ -2,18 +2,18 @@
 
 ``pipeline`` turns records into an evaluated model. ``registry`` lists all kinds of model,
 ``settings`` their settings, ``fit_api`` the types of a fit, ``fit_data`` its prepared records.
+``refinement`` compares a model of runs with the one that they used.
 
 data        loops and histories from recordings and tables
 searched    play models whose thresholds are searched from several starts
 staged      free weights and stages for steady loops
 field       effective field and generalised Duhem operator for histories
 literature  other models of the literature
-refine      better models from recordings of their use
 """
 
 PUBLIC = (
     "data.cycles", "data.data_files", "data.records", "evaluation", "fit_api", "fit_data",
     "fit_model", "model_page", "model_quality", "model_selection", "parallel", "pipeline",
-    "refine.acceptance", "refine.refinement", "registry", "settings", "summary",
+    "refinement", "registry", "settings", "summary",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -11,15 +11,14 @@ from hilctl.lab.identify.data.records import History, Record, turning_points
 from hilctl.lab.identify.evaluation import Evaluation
 from hilctl.lab.identify.model_quality import Verdict
 from hilctl.lab.identify.pipeline import Identification
-from hilctl.lab.identify.refine.refinement import Refinement
+from hilctl.lab.identify.refinement import Refinement
 from hilctl.lab.identify.summary import (
-    class_table,
+    change_tables,
     loop_table,
     parameter_texts,
-    refinement_table,
+    refinement_lines,
     stroke_table,
     summary,
-    worse_lines,
 )
 from hilctl.lab.pages import html
 from hilctl.lab.pages.figure_layout import FigureSpec, Panel
@@ -141,15 +140,15 @@ def _some_cycles(command: F64) -> I64:
 
 def refinement_page(found: Refinement) -> str:
     """Return the page as HTML."""
-    after, unit = found.choice.after, found.model.input_unit
+    by_run, by_stroke = change_tables(found)
     body = [
-        *_head(found.model, [str(found), *worse_lines(found), after.how]),
-        "<h2>Errors on runs not fitted</h2>",
-        html.grid(*refinement_table(found)),
+        *_head(found.model, [*refinement_lines(found), found.held_out.how]),
+        "<h2>Errors on data not fitted</h2>",
+        html.grid(*by_run),
         "<h2>Errors by stroke</h2>",
-        html.grid(*class_table(found)),
+        html.grid(*by_stroke),
     ]
-    for heading, held in (("Before", found.choice.before), ("After", after)):
+    for heading, judged in (("Before", found.before), ("After", found.after)):
         body += [f"<h2>{heading}</h2>"]
-        body += drawn_records(held.judgement, after.records, unit, MOST_RUNS)
+        body += drawn_records(judged, found.held_out.records, found.model.input_unit, MOST_RUNS)
     return html.document("Refined model", [*body, html.details("Model", dump_model(found.model))])

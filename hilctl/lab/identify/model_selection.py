@@ -273,7 +273,7 @@ def _undivided(records: Sequence[Record]) -> str:
     cut_s = record.time_s[record.ignore + round(HEAD * (record.command.size - record.ignore))]
     return (
         f"from {cut_s:.4g} s, '{record.label}' moves further or faster than before, or hardly. "
-        "Add a file of other motions with --validate, or set --model field"
+        "Add a file of other motions with --validate, or use hilctl identify --model field"
     )
 
 

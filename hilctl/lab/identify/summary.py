@@ -3,12 +3,11 @@
 from collections.abc import Sequence
 from typing import TypeAlias
 
-from hilctl.lab.identify.evaluation import Evaluation, LoopScore
+from hilctl.lab.identify.evaluation import Evaluation, LoopScore, StrokeError
 from hilctl.lab.identify.fit_model import FittedModel
 from hilctl.lab.identify.model_quality import Verdict
 from hilctl.lab.identify.pipeline import Identification
-from hilctl.lab.identify.refine.acceptance import ErrorChange
-from hilctl.lab.identify.refine.refinement import Refinement
+from hilctl.lab.identify.refinement import Refinement
 
 Table: TypeAlias = tuple[tuple[str, ...], list[tuple[str, ...]]]
 """Headings, and rows of texts."""
@@ -79,20 +78,32 @@ def _span(limits: tuple[float, float]) -> str:
     return low if low == high else f"{low} to {high}"
 
 
-def refinement_table(found: Refinement) -> Table:
-    """Return the errors of each held-out run before and after."""
-    return _change_table(("run", "p-p µm"), found.choice.runs)
+def refinement_lines(found: Refinement) -> list[str]:
+    """Return the comparison of both models, and the result of the identification."""
+    lines = [str(found), *summary(found.identification)]
+    if found.offsets_um:
+        offsets = ", ".join(f"{offset_um:.3g}" for offset_um in found.offsets_um)
+        lines.append(f"removed a constant displacement per run: {offsets} µm")
+    return lines
 
 
-def class_table(found: Refinement) -> Table:
-    """Return the errors of each class of held-out runs before and after."""
-    return _change_table(("class", "largest p-p µm"), found.choice.classes)
+def change_tables(found: Refinement) -> tuple[Table, Table]:
+    """Return the errors before and after, of each record and of each class of strokes."""
+    before, after = found.before, found.after
+    return (
+        _change_table("run", before.errors, after.errors),
+        _change_table("stroke", before.classes, after.classes),
+    )
 
 
-def _change_table(first: tuple[str, str], changes: Sequence[ErrorChange]) -> Table:
-    return (*first, "peak % before", "after", "rms % before", "after"), [
-        _row(e.label, e.peak_to_peak_um, e.peak_before, e.peak_after, e.before, e.after)
-        for e in changes
+def _change_table(
+    what: str,
+    before: Sequence[LoopScore | StrokeError],
+    after: Sequence[LoopScore | StrokeError],
+) -> Table:
+    return (what, "peak % before", "after", "rms % before", "after"), [
+        _row(was.label, was.peak_percent, now.peak_percent, was.rms_percent, now.rms_percent)
+        for was, now in zip(before, after, strict=True)
     ]
 
 
@@ -102,8 +113,3 @@ def stroke_table(verdict: Verdict) -> Table:
         (*_row(each.label, each.peak_percent, each.rms_percent), f"{each.motions}")
         for each in verdict.classes
     ]
-
-
-def worse_lines(found: Refinement) -> list[str]:
-    """Return one line per held-out run whose error increases with the accepted model."""
-    return [f"worse: {run}" for run in found.worse] if found.better else []

@@ -1,1 +1,0 @@
-"""Refinement of models by recordings of their use."""
