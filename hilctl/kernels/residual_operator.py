@@ -15,9 +15,7 @@ updated in place, so any cut into blocks gives the same bits.
 
 Sources: I. D. Mayergoyz, "Mathematical Models of Hysteresis", Springer 1991 (plays as Preisach's
 triangle); P. R. Dahl, "Solid friction damping of mechanical vibrations", AIAA J. 14 (1976) 1675
-(drags); C. Eun and E. J. Powers, "A new Volterra predistorter based on the indirect learning
-architecture", IEEE Trans. Signal Process. 45 (1997) 223 (a model of a remainder, linear in what is
-looked for).
+(drags).
 """
 
 import math
@@ -25,7 +23,7 @@ from typing import TypeAlias
 
 import numpy as np
 
-from hilctl.base.types import F64, F64_2D, I64
+from hilctl.base.types import F64
 from hilctl.kernels.jit import kernel
 
 Tables: TypeAlias = tuple[F64, F64, F64, F64, F64]
@@ -157,42 +155,3 @@ def residual_inverse(y: F64, tables: Tables, memory: F64, out: F64) -> None:
             _settle(out[k], now, memory, tables)
         else:
             out[k] = np.nan
-
-
-@kernel()
-def residual_columns(x: F64, rows: I64, window: int, tables: Tables, out: F64_2D) -> None:
-    """Fill in the terms that R is linear in, for identification: slopes in each cell, a, b and c.
-
-    ``x`` is float64[m], from rest, and ``rows`` int64[N], the samples that are filled in, rising.
-    Only thresholds, lengths and grid of the tables are used. ``out``, float64[N, p c + (2 d + 1) (c
-    + 1)], is of zeros.
-    """
-    thresholds, lengths, _, _, grid = tables
-    low, width, cells = grid[0], grid[1], int(grid[2])
-    plays, drags = thresholds.size, lengths.size
-    held, s = np.zeros(plays), np.zeros(drags)
-    row, last = 0, 0.0
-    for k in range(x.size):
-        now = x[k]
-        for i in range(plays):
-            held[i] = max(min(held[i], now + thresholds[i]), now - thresholds[i])
-        for i in range(drags):
-            kept = math.exp(-abs(now - last) / lengths[i])
-            s[i] = s[i] * kept + math.copysign(1.0, now - last) * (1.0 - kept)
-        last = now
-        if row < rows.size and k == rows[row]:
-            for i in range(plays):
-                for j in range(cells):
-                    edge = low + j * width
-                    rest = min(max(-edge, 0.0), width)
-                    out[row, i * cells + j] = min(max(held[i] - edge, 0.0), width) - rest
-            place = _within((now - low) / width, grid[2])
-            cell = min(int(place), cells - 1)
-            part = place - cell
-            rate = max(-1.0, min(1.0, (now - x[max(k - window, 0)]) / grid[3]))
-            for i in range(2 * drags + 1):
-                factor = rate if i == 2 * drags else (s[i] if i < drags else s[i - drags] ** 2)
-                first = plays * cells + i * (cells + 1) + cell
-                out[row, first] = (1.0 - part) * factor
-                out[row, first + 1] = part * factor
-            row += 1

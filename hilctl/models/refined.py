@@ -1,14 +1,11 @@
-"""A model with its identified residual, and the inverse of both."""
+"""A model with its identified residual, and the inverse of both: read from files of 0.2.0."""
 
 from collections.abc import Callable, Iterator
-from functools import cache
-from itertools import combinations
 from typing import Annotated, Any, Literal, TypeAlias
 
 import numpy as np
 
 from hilctl.base.strict import CheckedModel, Field
-from hilctl.base.types import F64
 from hilctl.kernels.residual_operator import Tables, residual_forward, residual_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, threshold_problems
 from hilctl.models.implicit_models import (
@@ -20,7 +17,7 @@ from hilctl.models.implicit_models import (
 from hilctl.models.integrated import ButterflyModel, IntegratedModel
 from hilctl.models.linear_stages import Chain, FirstMode
 from hilctl.models.plays import GeneralisedModel, PpiModel, RdpiModel, SpiModel
-from hilctl.models.staged import StagedModel, split_frame
+from hilctl.models.staged import StagedModel
 
 Refinable: TypeAlias = (
     PpiModel
@@ -36,11 +33,6 @@ Refinable: TypeAlias = (
     | DuhemModel
 )
 """Every kind of model except the refined one."""
-
-LEAST_SLOPE = 0.1
-"""Least allowed slope of x + R[x] by the next x, for any history."""
-_POSITIONS = 60  # of x at which the slope is evaluated
-_TURNS = (0.02, 2.0, 8)  # nearest and furthest turn in longest drag lengths, number of turns
 
 
 class ResidualOperator(CheckedModel):
@@ -69,13 +61,6 @@ class ResidualOperator(CheckedModel):
     fastest_um_per_s: float = Field(gt=0.0, allow_inf_nan=False)
 
     def _problems(self) -> Iterator[str]:
-        if problems := list(self._shape_problems()):
-            yield from problems
-        elif not (least := self.least_slope) >= LEAST_SLOPE:
-            rule = f"the slope of x + R[x] must be >= {LEAST_SLOPE} for one inverse to exist"
-            yield f"{rule}: {least}"
-
-    def _shape_problems(self) -> Iterator[str]:
         if not self.thresholds_um or self.thresholds_um[0] != 0.0:
             yield f"the first of thresholds_um must be 0: {list(self.thresholds_um[:1])}"
         yield from threshold_problems("r", self.thresholds_um[1:])
@@ -94,54 +79,6 @@ class ResidualOperator(CheckedModel):
     def operators(self) -> int:
         """Number of plays and drags."""
         return len(self.thresholds_um) + len(self.lengths_um)
-
-    @property
-    def least_slope(self) -> float:
-        """Least slope of x + R[x] by the next x, for any history.
-
-        After a turn of x the plays follow it one by one, the narrowest first; the drags have the
-        states of earlier turns.
-        """
-        edges = self._edges()
-        slack = 0.01 * self.cell_um
-        x = np.linspace(edges[0] + slack, edges[-1] - slack, _POSITIONS).astype(np.float64)
-        least = min(
-            float((self._play_slope(x, edges, way) + self._drag_slope(x, edges, way)).min())
-            for way in (1.0, -1.0)
-        )
-        return 1.0 + least + float(self._rate_slope(x, edges).min())
-
-    def _edges(self) -> F64:
-        edges: F64 = self.lowest_um + self.cell_um * np.arange(len(self.rate_um), dtype=np.float64)
-        return edges
-
-    def _play_slope(self, x: F64, edges: F64, way: float) -> F64:
-        """Return the least slope of the plays for a direction of x: float64[n]."""
-        held = x[:, None] - way * np.array(self.thresholds_um)
-        cell = np.floor((held - edges[0]) / self.cell_um).astype(np.int64)
-        inside = (cell >= 0) & (cell < edges.size - 1)
-        slopes = np.array(self.slopes)[
-            np.arange(len(self.slopes)), np.clip(cell, 0, edges.size - 2)
-        ]
-        return np.asarray(np.cumsum(slopes * inside, axis=1).min(axis=1))
-
-    def _drag_slope(self, x: F64, edges: F64, way: float) -> F64:
-        """Return the least slope of the drags for a direction of x: float64[n]."""
-        if not self.lengths_um:
-            return np.zeros(x.size)
-        lengths, count = np.array(self.lengths_um), len(self.lengths_um)
-        states = _states(self.lengths_um)
-        moves = (1.0 - way * states) / lengths  # of a state, by the path of x
-        lines = [_line(x, edges, np.array(line)) for line in self.drags_um]
-        values, bends = (np.stack(each) for each in zip(*lines, strict=True))
-        slopes = states @ bends[:count] + states**2 @ bends[count:]
-        slopes += moves @ values[:count] + (2.0 * states * moves) @ values[count:]
-        return np.asarray(slopes.min(axis=0))
-
-    def _rate_slope(self, x: F64, edges: F64) -> F64:
-        value, bend = _line(x, edges, np.array(self.rate_um))
-        change_um = self.fastest_um_per_s * self.window_s
-        return np.asarray(-np.abs(bend) + np.minimum(value / change_um, 0.0))
 
     def forward(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
         """Return x + R[x] at rest, for displacements that are ``rest_um`` at rest."""
@@ -162,9 +99,10 @@ class ResidualOperator(CheckedModel):
         """Return the tables of the kernels, and the window in samples."""
         slopes = np.array(self.slopes)
         plays, cells = slopes.shape
+        edges = self.lowest_um + self.cell_um * np.arange(cells + 1)
         values = np.zeros((plays, cells + 1))
         np.cumsum(slopes * self.cell_um, axis=1, out=values[:, 1:])
-        values -= np.array([[np.interp(0.0, self._edges(), line)] for line in values])
+        values -= np.array([[np.interp(0.0, edges, line)] for line in values])
         lines = np.array([*self.drags_um, self.rate_um])
         window = max(1, round(self.window_s * sample_rate_hz))
         fastest = self.fastest_um_per_s * window / sample_rate_hz
@@ -172,32 +110,6 @@ class ResidualOperator(CheckedModel):
         grid = np.array([self.lowest_um, self.cell_um, float(cells), fastest, 1.001 * most + 1e-3])
         arrays = np.array(self.thresholds_um), np.array(self.lengths_um), values.ravel()
         return (*arrays, lines.ravel(), grid), window
-
-
-@cache
-def _states(lengths_um: tuple[float, ...]) -> F64:
-    """Return the states of drags after a few turns: float64[m, d].
-
-    A state is the integral over the path of its sign times e^(-path / l) / l. A sum of d such
-    exponentials has at most d - 1 sign changes, so a weighted sum of drags is largest after that
-    many turns.
-    """
-    lengths = np.array(lengths_um)
-    at = float(lengths.max()) * np.geomspace(*_TURNS)
-    states = []
-    for turns in range(lengths.size):
-        for chosen in combinations(at, turns):
-            left = np.exp(-np.array(chosen)[:, None] / lengths)  # of the path before each turn
-            signs = (-1.0) ** np.arange(1, turns + 1)
-            states.append(1.0 + 2.0 * signs @ left)
-    both = np.array(states)
-    return np.concatenate((both, -both))
-
-
-def _line(x: F64, edges: F64, values: F64) -> tuple[F64, F64]:
-    """Return a line through points, and its slope: float64[n] each."""
-    cell = np.clip(np.searchsorted(edges, x) - 1, 0, edges.size - 2)
-    return np.interp(x, edges, values), (np.diff(values) / np.diff(edges))[cell]
 
 
 def rest_um(model: HysteresisModel) -> float:
@@ -217,14 +129,6 @@ class RefinedModel(HysteresisModel):
     kind: Literal["refined"] = "refined"
     base: Annotated[Refinable, Field(discriminator="kind")]
     residual: ResidualOperator
-
-    @classmethod
-    def of(
-        cls, model: HysteresisModel, residual: ResidualOperator, offset_um: float
-    ) -> "RefinedModel":
-        """Return a refined model with the unit, ranges and provenance of a model."""
-        base, shared = split_frame(model)
-        return cls(base=base, residual=residual, output_offset_um=offset_um, **shared)  # type: ignore[arg-type]
 
     def _problems(self) -> Iterator[str]:
         if self.base.input_unit != self.input_unit:

@@ -239,6 +239,14 @@ def test_golden_recordings_replay_bit_for_bit(path):
     assert result.samples > 1000
 
 
+def test_refined_model_of_0_2_0_replays_bit_for_bit():
+    """Nothing writes models with a residual operator any more."""
+    recording = read(Path(__file__).parents[1] / "data" / "refined_0_2_0.mcap")
+    result = replay(recording)
+    assert result.identical, result
+    assert result.samples > 1000
+
+
 def test_golden_recordings_are_there():
     """A compensated, an uncompensated and a voltage-driven run, and one with an older inverse."""
     names = {path.stem for path in GOLDEN}

@@ -12,14 +12,13 @@ from hilctl.base.errors import InputError
 from hilctl.models.model_export import export_text
 from hilctl.models.model_file import AnyModel
 from hilctl.models.plays import GeneralisedModel, PlayEnvelope, SpiModel
-from hilctl.models.refined import RefinedModel
 from hilctl.models.staged import AnyHysteresis, StagedModel
 from tests.published import piezo_ppi, terfenol_rdpi
 from tests.unit.models.test_effective_field import ACTIVATION, field_model
 from tests.unit.models.test_generalised_duhem import duhem_model
 from tests.unit.models.test_implicit_models import BOUC_WEN, DUHEM, KP, PLAIN, PREISACH
 from tests.unit.models.test_integrated import butterfly
-from tests.unit.models.test_refined import residual
+from tests.unit.models.test_refined import refined, residual
 from tests.unit.models.test_staged import OMEGA, STAGES
 
 RATE_HZ = 50_000.0
@@ -41,7 +40,7 @@ FORMS = {
     "staged": StagedModel.around(OMEGA, **STAGES["all"]),
     "field": StagedModel.around(field_model()),
     "generalised_duhem": StagedModel.around(duhem_model()),
-    "refined": RefinedModel.of(terfenol_rdpi(), residual(), 0.4),
+    "refined": refined(terfenol_rdpi(), residual(), 0.4),
 }  # fmt: skip
 FORMS["plays that creep"] = field_model(activation=ACTIVATION)
 FORMS["linear lag"] = StagedModel.around(OMEGA, **STAGES["linear lag"])
