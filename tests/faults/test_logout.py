@@ -12,7 +12,7 @@ from hilctl.recording.reader import read
 from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import base_folder, runs
 from tests.commands import typed
-from tests.faults.test_daemon import await_state, hilctl, start, stop_all
+from tests.faults.test_daemon import STOPPED, await_state, hilctl, start, stop_all
 
 
 @pytest.fixture
@@ -37,7 +37,7 @@ def test_it_is_still_found_changed_watched_and_stopped(logged_out):
     (ended,) = hilctl("stop", "--all")["runs"]
     assert ended["ended"]
     recording = read(logged_out)
-    assert recording.end["reason"] == "stopped by hilctl stop"
+    assert recording.end["reason"] == STOPPED
     assert "mark" in {event.code for event in recording.events}
     assert recording.dropped == 0
     assert hilctl("status")["runs"] == []

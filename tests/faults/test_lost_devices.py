@@ -15,6 +15,7 @@ from tests.faults.conftest import MODULE, Emulated, tcp
 
 AWAY_S = 2.0
 PULLED_AT = 80
+SETTING_SAFE = "setting the safe value"
 
 
 def said(*words, code=0):
@@ -70,7 +71,7 @@ def test_the_guardian_goes_on_after_the_command_and_says_so(abandoned):
     result = abandoned.result
     assert (result["output_state"], result["guardian_active"]) == ("unknown", True)
     (run,) = active()
-    assert (run["state"], run["output_state"]) == ("setting the safe value", "unknown")
+    assert (run["state"], run["output_state"]) == (SETTING_SAFE, "unknown")
     time.sleep(AWAY_S)
     abandoned.come_back()
     abandoned.await_output(0.0, within_s=5.0)
@@ -84,7 +85,7 @@ def test_the_guardian_goes_on_after_the_command_and_says_so(abandoned):
 def test_safe_by_hand_relieves_the_guardian_and_gives_back_what_it_cannot_do(abandoned):
     found = said("safe", abandoned.experiment, code=3)
     assert (found["output_state"], found["guardian_active"]) == ("unknown", True)
-    assert [run["state"] for run in active()] == ["setting the safe value"]
+    assert [run["state"] for run in active()] == [SETTING_SAFE]
     abandoned.come_back()
     found = said("safe", abandoned.experiment, code=3)
     assert (found["output_state"], found["guardian_active"]) == ("set", True)
@@ -109,7 +110,7 @@ def test_safe_by_hand_starts_a_dead_guardian_again(abandoned):
     abandoned.come_back()
     abandoned.await_output(0.0, within_s=10.0)
     (run,) = active()
-    assert run["state"] == "setting the safe value"
+    assert run["state"] == SETTING_SAFE
     assert said("stop", "--run", run["name"])["ended"]
     assert active() == []
     assert said("safe", abandoned.experiment)["output_state"] == "confirmed"
@@ -119,7 +120,7 @@ def test_a_new_run_relieves_the_guardian_once_it_starts(abandoned):
     words = ["run", abandoned.experiment, "--set", "waveform.duration_s=0.5"]
     words += ["--output", abandoned.experiment.with_name("again.mcap")]
     hilctl(*words, code=3)
-    assert [run["state"] for run in active()] == ["setting the safe value"]
+    assert [run["state"] for run in active()] == [SETTING_SAFE]
     abandoned.come_back()
     found = said(*words)
     assert (found["code"], found["output_state"]) == ("completed", "confirmed")
@@ -129,7 +130,7 @@ def test_a_new_run_relieves_the_guardian_once_it_starts(abandoned):
 def test_the_user_can_end_the_guardian(abandoned):
     (run,) = active()
     assert said("stop", "--run", run["name"])["ended"]
-    assert all(run["state"] != "setting the safe value" for run in active())
+    assert all(run["state"] != SETTING_SAFE for run in active())
 
 
 def test_the_recording_is_complete_while_the_guardian_still_tries(emulate, run, profile):
@@ -143,7 +144,7 @@ def test_the_recording_is_complete_while_the_guardian_still_tries(emulate, run, 
     os.kill(loop, signal.SIGKILL)
     started.process.communicate()
     (guarded,) = active()
-    assert guarded["state"] == "setting the safe value"
+    assert guarded["state"] == SETTING_SAFE
     recording = started.assert_recorded(at_least=50)
     assert recording.end["output_state"] == "unknown"
     module.come_back()
@@ -167,7 +168,7 @@ def test_a_loop_that_is_the_last_process_becomes_the_guardian(emulate, run, prof
     module.emulated.end()
     started.process.communicate()
     deadline = time.monotonic() + 60.0
-    while [each["state"] for each in active()] != ["setting the safe value"]:
+    while [each["state"] for each in active()] != [SETTING_SAFE]:
         assert time.monotonic() < deadline
     module.come_back()
     module.await_output(0.0, within_s=5.0)

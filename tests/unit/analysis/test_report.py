@@ -345,7 +345,7 @@ class TestWholeRun:
         assert counted.exchange_us["p50"] == pytest.approx(30.0)
 
     def test_counter_that_is_no_number_is_refused(self, lagging) -> None:
-        with pytest.raises(DataError, match=r"run\.mcap: hilctl\.end: late_ticks .* 'many'"):
+        with pytest.raises(DataError, match=r"late_ticks .* 'many'"):
             summarize(lagging(end={"late_ticks": "many"}))
 
     def test_limited_samples_are_those_of_the_waveform(self, lagging) -> None:
@@ -448,7 +448,7 @@ def test_what_a_run_wrote_is_read(loop):
     usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "1" + "0" * 400),
 ])  # fmt: skip
 def test_what_is_damaged_is_refused_with_its_place(text):
-    with pytest.raises(DataError, match=r"run\.mcap: hilctl\.end: processes: "):
+    with pytest.raises(DataError, match="processes: "):
         processes_of(with_end({USAGE_FACT: text}))
 
 

@@ -47,7 +47,7 @@ def test_given_texts_stand_for_the_disk(tmp_path, monkeypatch):
 def test_nothing_else_is_read_where_texts_are_given(tmp_path):
     path = tmp_path / "other.yaml"
     path.write_text("text")
-    with pytest.raises(InputError, match="was not read"):
+    with pytest.raises(InputError, match=r"other\.yaml"):
         TextFiles({}).read(path)
 
 
@@ -67,7 +67,7 @@ def test_a_text_too_large_is_not_read(tmp_path):
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         stream.truncate(20_000_000)
-    with pytest.raises(InputError, match=r"run\.mcap: has 20 MB.* 17 MB"):
+    with pytest.raises(InputError, match=r"20 MB.* 17 MB"):
         read_text(path)
 
 
@@ -112,7 +112,7 @@ class TestWriting:
             stream.write(b"mine")
             path.write_text("theirs")
 
-        with pytest.raises(InputError, match=r"out\.txt: exists already"):
+        with pytest.raises(InputError, match=r"out\.txt"):
             write_file(path, write, overwrite=False)
         assert path.read_text() == "theirs"
         assert list(tmp_path.iterdir()) == [path]
@@ -122,7 +122,7 @@ class TestWriting:
         write_text(tmp_path / "out.txt", "text", overwrite=False)
         assert (tmp_path / "out.txt").read_text() == "text"
         monkeypatch.setattr(Path, "replace", _refuse)
-        with pytest.raises(InputError, match=r"other\.txt: can't be written: Operation not perm"):
+        with pytest.raises(InputError, match=r"other\.txt: .*: Operation"):
             write_text(tmp_path / "other.txt", "text", overwrite=False)
         assert [each.name for each in tmp_path.iterdir()] == ["out.txt"]
 

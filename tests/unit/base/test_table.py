@@ -208,14 +208,14 @@ def test_rows(table, other: str, first: int, last: int | None, found: list[int] 
 
 def test_a_table_too_large_is_not_read(table, monkeypatch: pytest.MonkeyPatch) -> None:
     monkeypatch.setattr("hilctl.base.table.MAX_TABLE_BYTES", 1_000_000)
-    with pytest.raises(InputError, match=r"t\.csv: has 2 MB.* 1 MB"):
+    with pytest.raises(InputError, match=r"2 MB.* 1 MB"):
         table(b"\xff" * 2_000_000)
 
 
 def test_lines_that_are_no_row_are_refused_at_once(tmp_path):
     path = tmp_path / "wide.csv"
     path.write_text("1," * 5000 + "\n1\n")
-    with pytest.raises(DataError, match="at most 1000 columns"):
+    with pytest.raises(DataError, match="1000 columns"):
         TextTable(path)
 
 

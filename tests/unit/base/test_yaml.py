@@ -61,6 +61,11 @@ def problems(text, **settings):
     return str(caught.value).split("\n")
 
 
+def places(error):
+    """Return the place and the key of each problem."""
+    return [f"{each.where}: {each.key}" for each in error.problems]
+
+
 def refusal(action, *arguments):
     with pytest.raises(ConfigError) as caught:
         action(*arguments)
@@ -86,58 +91,49 @@ def test_every_value_has_its_line(loc, place):
     assert document().where(loc) == f"bench.yaml:{place}"
 
 
-@pytest.mark.parametrize(("before", "after", "problem"), [
-    ("6.0", "'6.0'",
-     "bench.yaml:3: limits.peak_a: must be a number, got '6.0' (remove the quotes)"),
-    ("6.0", "'1e3'",
-     "bench.yaml:3: limits.peak_a: must be a number, got '1e3' (remove the quotes)"),
-    ("6.0", "1,500", "bench.yaml:3: limits.peak_a: must be a number, got '1,500' "
-     "(1.500 or 1500? write a decimal point, or none)"),
-    ("6.0", "1_000", "bench.yaml:3: limits.peak_a: must be a number, got '1_000' "
-     "(write a plain number, such as 1000, 0.5 or 1e-3)"),
-    ("6.0", "1:30", "bench.yaml:3: limits.peak_a: must be a number, got '1:30' "
-     "(write a plain number, such as 1000, 0.5 or 1e-3)"),
-    ("6.0", "on", "bench.yaml:3: limits.peak_a: must be a number, got 'on'"),
-    ("6.0", "six", "bench.yaml:3: limits.peak_a: must be a number, got 'six'"),
-    ("6.0", "nan", "bench.yaml:3: limits.peak_a: must be a number, got 'nan'"),
-    ("6.0", "1e999", "bench.yaml:3: limits.peak_a: must be a finite number, got inf"),
-    ("6.0", ".nan", "bench.yaml:3: limits.peak_a: must be a finite number, got nan"),
-    ("6.0", "-.inf", "bench.yaml:3: limits.peak_a: must be a finite number, got -inf"),
-    ("6.0", "1.0e+999", "bench.yaml:3: limits.peak_a: must be a finite number, got inf"),
-    ("6.0", "2024-01-01", "bench.yaml:3: limits.peak_a: must be a number, got '2024-01-01' "
-     "(write a plain number, such as 1000, 0.5 or 1e-3)"),
-    ("6.0", "", "bench.yaml:3: limits.peak_a: must be a number, got nothing"),
-    ("[1, 2, 3]", "[1, 2.5]", "bench.yaml:4: limits.steps.1: must be a whole number, got 2.5"),
-    ("[1, 2, 3]", "[]", "bench.yaml:4: limits.steps: must have at least 1 values, got []"),
-    ("[1, 2, 3]", "[1, 2, 3, 4]",
-     "bench.yaml:4: limits.steps: must have at most 3 values, got [1, 2, 3, 4]"),
-    ("[1, 2, 3]", "7", "bench.yaml:4: limits.steps: must be a list, got 7"),
-    ("[1, 2, 3]", "[1000.5]",
-     "bench.yaml:4: limits.steps.0: must be a whole number, got 1000.5"),
-    ("bench", "true", "bench.yaml:1: name: must be text, got true (put it in quotes)"),
-    ("bench", "5", "bench.yaml:1: name: must be text, got 5 (put it in quotes)"),
-    ("  peak_a", "  slow: on\n  peak_a",
-     "bench.yaml:3: limits.slow: must be true or false, got 'on' (write true or false)"),
-    ("  peak_a: 6.0\n", "", "bench.yaml:2: limits.peak_a: is required"),
-    ("peak_a", "peek_a", "bench.yaml:3: limits.peek_a: unknown key (did you mean 'peak_a'?)"),
-    ("peak_a", "zzz", "bench.yaml:3: limits.zzz: unknown key (known: peak_a, slow, steps)"),
-    ("2.5", "0.0", "bench.yaml:7: parts.0.radius_um: must be > 0.0, got 0.0"),
-    ("2.5", "10.0", "bench.yaml:7: parts.0.radius_um: must be < 10.0, got 10.0"),
-    ("4.0", "-1", "bench.yaml:9: parts.1.side_um: must be >= 0.0, got -1"),
-    ("4.0", "11", "bench.yaml:9: parts.1.side_um: must be <= 10.0, got 11"),
-    ("side_um", "square: 1.0\n    sid_um",
-     "bench.yaml:10: parts.1.sid_um: unknown key (did you mean 'side_um'?)"),
-    ("radius_um: 2.5", "round: 2.5",
-     "bench.yaml:7: parts.0.round: unknown key (known: kind, radius_um)"),
-    ("kind: square", "kind: sqare",
-     "bench.yaml:8: parts.1.kind: must be one of 'round', 'square', got 'sqare' "
-     "(did you mean 'square'?)"),
-    ("kind: square\n    ", "", "bench.yaml:8: parts.1: needs a 'kind' (one of round, square)"),
-    ("parts:", "colours: {red: x}\nparts:",
-     "bench.yaml:5: colours.red: must be a number, got 'x'"),
+@pytest.mark.parametrize(("before", "after", "place", "value", "part"), [
+    ("6.0", "'6.0'", "3: limits.peak_a", "'6.0'", "quotes"),
+    ("6.0", "'1e3'", "3: limits.peak_a", "'1e3'", "quotes"),
+    ("6.0", "1,500", "3: limits.peak_a", "'1,500'", "1.500 or 1500"),
+    ("6.0", "1_000", "3: limits.peak_a", "'1_000'", "plain number"),
+    ("6.0", "1:30", "3: limits.peak_a", "'1:30'", "plain number"),
+    ("6.0", "on", "3: limits.peak_a", "'on'", "number"),
+    ("6.0", "six", "3: limits.peak_a", "'six'", "number"),
+    ("6.0", "nan", "3: limits.peak_a", "'nan'", "number"),
+    ("6.0", "1e999", "3: limits.peak_a", "inf", "finite"),
+    ("6.0", ".nan", "3: limits.peak_a", "nan", "finite"),
+    ("6.0", "-.inf", "3: limits.peak_a", "-inf", "finite"),
+    ("6.0", "1.0e+999", "3: limits.peak_a", "inf", "finite"),
+    ("6.0", "2024-01-01", "3: limits.peak_a", "'2024-01-01'", "plain number"),
+    ("6.0", "", "3: limits.peak_a", "nothing", "number"),
+    ("[1, 2, 3]", "[1, 2.5]", "4: limits.steps.1", "2.5", "whole"),
+    ("[1, 2, 3]", "[]", "4: limits.steps", "[]", "at least 1"),
+    ("[1, 2, 3]", "[1, 2, 3, 4]", "4: limits.steps", "[1, 2, 3, 4]", "at most 3"),
+    ("[1, 2, 3]", "7", "4: limits.steps", "7", "list"),
+    ("[1, 2, 3]", "[1000.5]", "4: limits.steps.0", "1000.5", "whole"),
+    ("bench", "true", "1: name", "true", "quotes"),
+    ("bench", "5", "1: name", "5", "quotes"),
+    ("  peak_a", "  slow: on\n  peak_a", "3: limits.slow", "'on'", "true or false"),
+    ("  peak_a: 6.0\n", "", "2: limits.peak_a", "", "required"),
+    ("peak_a", "peek_a", "3: limits.peek_a", "", "'peak_a'"),
+    ("peak_a", "zzz", "3: limits.zzz", "", "peak_a, slow, steps"),
+    ("2.5", "0.0", "7: parts.0.radius_um", "0.0", "> 0.0"),
+    ("2.5", "10.0", "7: parts.0.radius_um", "10.0", "< 10.0"),
+    ("4.0", "-1", "9: parts.1.side_um", "-1", ">= 0.0"),
+    ("4.0", "11", "9: parts.1.side_um", "11", "<= 10.0"),
+    ("side_um", "square: 1.0\n    sid_um", "10: parts.1.sid_um", "", "'side_um'"),
+    ("radius_um: 2.5", "round: 2.5", "7: parts.0.round", "", "kind, radius_um"),
+    ("kind: square", "kind: sqare", "8: parts.1.kind", "'sqare'", "'square'"),
+    ("kind: square\n    ", "", "8: parts.1", "", "round, square"),
+    ("parts:", "colours: {red: x}\nparts:", "5: colours.red", "'x'", "number"),
 ])  # fmt: skip
-def test_broken_rules_in_words(before, after, problem):
-    assert problem in problems(changed(before, after))
+def test_problem_has_place_value_and_rule(before, after, place, value, part):
+    with pytest.raises(ConfigError) as caught:
+        document(changed(before, after)).validate(SetUp)
+    found = {f"{each.where}: {each.key}": each for each in caught.value.problems}
+    problem = found[f"bench.yaml:{place}"]
+    assert problem.value == value
+    assert part in f"{problem.rule} {problem.hint}"
 
 
 def test_all_problems_come_together():
@@ -153,13 +149,13 @@ def test_all_problems_come_together():
 def test_part_of_a_document():
     first = ("parts", 0)
     assert document().validate(Round, at=first).radius_um == 2.5
-    with pytest.raises(ConfigError, match=r"bench\.yaml:6: parts\.0\.kind: unknown key"):
+    with pytest.raises(ConfigError, match=r"bench\.yaml:6: parts\.0\.kind: "):
         document().validate(Limits, at=first)
     with pytest.raises(ConfigError) as caught:
         document().validate(Limits, at=first, without=("kind",))
-    assert str(caught.value).split("\n") == [
-        "bench.yaml:6: parts.0.peak_a: is required",
-        "bench.yaml:7: parts.0.radius_um: unknown key (known: peak_a, slow, steps)",
+    assert places(caught.value) == [
+        "bench.yaml:6: parts.0.peak_a",
+        "bench.yaml:7: parts.0.radius_um",
     ]
 
 
@@ -177,7 +173,7 @@ def test_context_reaches_the_validators():
 
     one = document("name: bench\n")
     assert one.validate(Named, context={"names": ["bench"]}).name == "bench"
-    with pytest.raises(ConfigError, match=r"bench\.yaml:1: name: must be known"):
+    with pytest.raises(ConfigError, match=r"bench\.yaml:1: name: "):
         one.validate(Named, context={"names": []})
 
 
@@ -189,10 +185,9 @@ def test_long_values_are_cut():
 
 def test_duplicate_keys_are_all_named():
     text = changed("peak_a: 6.0", "peak_a: 6.0\n  peak_a: 7.0") + "name: again\n"
-    assert refusal(document, text).split("\n") == [
-        "bench.yaml:4: limits.peak_a: stands already at bench.yaml:3",
-        "bench.yaml:11: name: stands already at bench.yaml:1",
-    ]
+    with pytest.raises(ConfigError) as caught:
+        document(text)
+    assert places(caught.value) == ["bench.yaml:4: limits.peak_a", "bench.yaml:11: name"]
 
 
 @pytest.mark.parametrize(("text", "message"), [
@@ -288,13 +283,12 @@ def test_problems_of_a_setting_point_to_it():
         one.set(assignment)
     with pytest.raises(ConfigError) as caught:
         one.validate(SetUp)
-    assert str(caught.value).split("\n") == [
-        "--set limits.peak_a=1_0: limits.peak_a: must be a number, got '1_0' "
-        "(write a plain number, such as 1000, 0.5 or 1e-3)",
-        "--set parts.0={kind: round, radius: 1.0}: parts.0.radius_um: is required",
-        "--set parts.0={kind: round, radius: 1.0}: parts.0.radius: unknown key "
-        "(did you mean 'radius_um'?)",
-        "--set colors.red=1: colors: unknown key (did you mean 'colours'?)",
+    part = "--set parts.0={kind: round, radius: 1.0}"
+    assert places(caught.value) == [
+        "--set limits.peak_a=1_0: limits.peak_a",
+        f"{part}: parts.0.radius_um",
+        f"{part}: parts.0.radius",
+        "--set colors.red=1: colors",
     ]
 
 

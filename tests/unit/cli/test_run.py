@@ -200,22 +200,6 @@ def test_simulated_and_incomplete_runs_are_marked(lagging):
     assert "NOT complete" in terminal(summarize(replace(lagging(), end={})))
 
 
-def test_uncompensated_run_shows_no_errors(make_recording):
-    recording = make_recording(wave(1000.0, 3), segments=[segment(0, 3000, 1000.0)])
-    text = terminal(summarize(recording))
-    assert "error" not in text
-    assert "no compensator" in text
-
-
-def test_segments_have_a_table_without_empty_columns(make_recording):
-    parts = [segment(0, 3000, 1000.0, "first"), segment(3000, 3000, 1000.0, "second")]
-    recording = make_recording(wave(1000.0, 6, LAG), command=wave(1000.0, 6), segments=parts)
-    text = terminal(summarize(recording))
-    for shown in ("first", "second", "peak hyst. %"):
-        assert shown in text
-    assert "err. %" not in text
-
-
 @pytest.mark.parametrize(("minutes", "shown"), [(20, range(20)), (21, range(1, 21))])
 def test_worst_minutes_are_shown(lagging, minutes, shown):
     late = {"p50": 80.0, "p90": 90.0, "p99": 95.0, "p99.9": 99.0}

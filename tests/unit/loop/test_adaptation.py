@@ -162,7 +162,7 @@ def test_events():
     assert event is not None
     assert (event.code, event.level, event.sample) == (ADAPTED, "warning", 6000)
     assert event.values["offset_um"] == 1.0
-    assert "at its bound: offset_um" in event.text
+    assert "bound: offset_um" in event.text
     assert adapting.event(9000) is None
     last = adapting.event(9001, ended=True)
     assert last is not None

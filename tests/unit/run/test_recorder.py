@@ -126,7 +126,7 @@ def test_a_disk_that_can_not_keep_the_recording_is_an_error(begun, monkeypatch):
     made.batch(batch(0, 20))
     made.flush()
     assert not made.finish(END, 200, patience_s=0.0)
-    assert "not brought to the disk: Input/output error" in made.error
+    assert "Input/output" in made.error
 
 
 def test_the_state_of_the_device_names_the_run_and_how_it_ended(checked, tmp_path):
@@ -263,7 +263,7 @@ def test_a_postponed_start_is_in_the_file(begun, refused):
 
 def test_a_recording_that_is_deleted_before_the_start_is_refused(on_a_disk):
     shutil.rmtree(on_a_disk.path.parent)
-    with pytest.raises(InputError, match="the file was deleted or renamed"):
+    with pytest.raises(InputError, match="deleted"):
         on_a_disk.begin(10**18, {})
     on_a_disk.discard()
 

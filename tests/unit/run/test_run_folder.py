@@ -78,7 +78,7 @@ def test_dead_run_is_taken_over_once(tmp_path):
 def test_folder_that_others_can_write_is_refused(tmp_path):
     (tmp_path / "runs").mkdir()
     (tmp_path / "runs").chmod(0o777)
-    with pytest.raises(RunError, match="must be yours"):
+    with pytest.raises(RunError, match="yours"):
         base_folder()
 
 
@@ -176,7 +176,7 @@ def test_folder_that_can_not_be_made_is_one_message(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "pathlib.Path.write_text", Mock(side_effect=OSError(28, "No space left on device"))
     )
-    with pytest.raises(RunError, match="No space left"), made(tmp_path):
+    with pytest.raises(RunError, match="No space"), made(tmp_path):
         pass
     assert list(base_folder().iterdir()) == []
 
@@ -203,7 +203,7 @@ def test_somebody_in_the_first_place_locks_nobody_out(tmp_path, places, monkeypa
     trap = tmp_path / "trap"
     trap.mkdir(mode=0o700)
     places[0].symlink_to(trap)
-    with pytest.raises(RunError, match="first: Not a directory"):
+    with pytest.raises(RunError, match="first: "):
         runs()  # a link of one's own is a mistake to be told of
     monkeypatch.setattr("hilctl.run.run_folder._is_own", lambda _: False)
     assert runs() == []
@@ -282,14 +282,14 @@ def test_a_device_of_another_user_is_refused_and_can_be_taken_over(squatted, cap
     name, squatter = squatted
     if listening:
         squatter.listen()
-    refused(name, match="hilctl run --take-over")
+    refused(name, match="--take-over")
     with DeviceLocks((name,), take_over=True) as locks:
         locks.acquire()
         locks.acquire()
         (warned,) = caplog.messages
         assert name in warned
         assert (f"process {os.getpid()} of user {STRANGER}" in warned) == listening
-        refused(name, match="wait for its end")  # its holder is this user's
+        refused(name, match="in use")  # its holder is this user's
 
 
 def test_a_process_that_waits_for_another_user_keeps_nothing(squatted):

@@ -46,9 +46,14 @@ CASES: list[tuple[dict[str, Any], Callable[[float], float]]] = [
      lambda t: 7.0 * (1 - t / 2.0) * math.sin(2 * math.pi * 10 * t)),
     ({"kind": "chirp", "amplitude": 2.0, "start_hz": 5.0, "stop_hz": 45.0, "duration_s": 0.8},
      lambda t: 2.0 * math.sin(2 * math.pi * (5.0 * t + 25.0 * t * t))),
+    ({"kind": "chirp", "amplitude": 2.0, "start_hz": 45.0, "stop_hz": 5.0, "duration_s": 0.8},
+     lambda t: 2.0 * math.sin(2 * math.pi * (45.0 * t - 25.0 * t * t))),
     ({"kind": "chirp", "amplitude": 2.0, "start_hz": 5.0, "stop_hz": 80.0,
       "spacing": "logarithmic", "duration_s": 0.5},
      lambda t: 2.0 * math.sin(2 * math.pi * 5.0 * 0.5 / math.log(16) * (16 ** (2 * t) - 1))),
+    ({"kind": "chirp", "amplitude": 2.0, "start_hz": 80.0, "stop_hz": 5.0,
+      "spacing": "logarithmic", "duration_s": 0.5},
+     lambda t: 2.0 * math.sin(2 * math.pi * 80.0 * 0.5 / math.log(16) * (1 - 16 ** (-2 * t)))),
     ({"kind": "hold", "level": -3.5, "offset": 1.0, "duration_s": 0.1}, lambda _: -2.5),
 ]  # fmt: skip
 
@@ -133,34 +138,7 @@ class TestPath:
         assert values[-1] == pytest.approx(51.99)
 
 
-def rising_crossings_s(values: F64, rate_hz: float) -> F64:
-    """Return the interpolated times at which a signal goes up through 0."""
-    k = np.flatnonzero((values[:-1] < 0.0) & (values[1:] >= 0.0))
-    return (k - values[k] / (values[k + 1] - values[k])) / rate_hz
-
-
 class TestChirp:
-    @pytest.mark.parametrize(("start_hz", "stop_hz"), [(10.0, 200.0), (200.0, 10.0)])
-    def test_linear_frequency(self, made: Made, start_hz: float, stop_hz: float) -> None:
-        keys = {"start_hz": start_hz, "stop_hz": stop_hz, "duration_s": 2.0}
-        values = made(50e3, kind="chirp", amplitude=1.0, **keys).values
-        times = rising_crossings_s(values, 50e3)
-        middle = 0.5 * (times[1:] + times[:-1])
-        expected = start_hz + (stop_hz - start_hz) * middle / 2.0
-        np.testing.assert_allclose(1.0 / np.diff(times), expected, rtol=2e-4)
-        assert times.size == pytest.approx(2.0 * (start_hz + stop_hz) / 2.0, abs=1.0)
-
-    @pytest.mark.parametrize(("start_hz", "stop_hz"), [(10.0, 1000.0), (1000.0, 10.0)])
-    def test_logarithmic_frequency(self, made: Made, start_hz: float, stop_hz: float) -> None:
-        keys = {"start_hz": start_hz, "stop_hz": stop_hz, "duration_s": 2.0}
-        values = made(50e3, kind="chirp", amplitude=1.0, spacing="logarithmic", **keys).values
-        times = rising_crossings_s(values, 50e3)
-        middle = 0.5 * (times[1:] + times[:-1])
-        expected = start_hz * (stop_hz / start_hz) ** (middle / 2.0)
-        np.testing.assert_allclose(1.0 / np.diff(times), expected, rtol=3e-3)
-        at_half = np.interp(1.0, middle, 1.0 / np.diff(times))
-        assert at_half == pytest.approx(100.0, rel=0.01)
-
     @pytest.mark.parametrize("stop_hz", [5.0, np.nextafter(5.0, 6.0)])
     def test_a_frequency_that_stands_still(self, made: Made, stop_hz: float) -> None:
         keys = {"start_hz": 5.0, "stop_hz": float(stop_hz), "duration_s": 1.0}
@@ -202,14 +180,6 @@ class TestMultisine:
         values = made(5000.0, amplitude=amplitude, duration_s=1.0, offset=2.0, **BAND).values
         assert np.max(np.abs(values - 2.0)) == pytest.approx(amplitude, rel=1e-12)
 
-    def test_crest_factor(self, made: Made) -> None:
-        values = made(5000.0, amplitude=1.0, duration_s=1.0, **BAND).values
-        crest = 1.0 / math.sqrt(float(np.mean(values**2)))
-        t = np.arange(5000) / 5000.0
-        in_phase = sum(np.cos(2 * np.pi * f * t) for f in range(10, 101, 5))
-        assert crest < 2.0
-        assert np.max(in_phase) / np.sqrt(np.mean(in_phase**2)) > 6.0
-
     def test_one_sine(self, made: Made) -> None:
         keys = {"first_hz": 10.0, "last_hz": 14.9, "step_hz": 5.0}
         reference = made(1000.0, kind="multisine", amplitude=2.0, duration_s=1.0, **keys)
@@ -231,16 +201,6 @@ class TestMultisine:
         keys = {"first_hz": 10.0, "last_hz": 10.0, "step_hz": 1.0}
         values = made(1000.0, kind="multisine", amplitude=2.0, duration_s=0.001, **keys).values
         np.testing.assert_array_equal(values, [0.0])
-
-
-class TestEnvelope:
-    @pytest.mark.parametrize("kind", ["growing", "decaying"])
-    def test_peaks_follow_time(self, made: Made, kind: str) -> None:
-        keys = {"amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 1.0}
-        values = made(1000.0, kind=kind, **keys).values.reshape(10, 100)
-        crest_s = 0.025 + 0.1 * np.arange(10)
-        envelope = crest_s if kind == "growing" else 1.0 - crest_s
-        np.testing.assert_allclose(values[:, 25], 7.0 * envelope, rtol=1e-12)
 
 
 @pytest.mark.parametrize(("duration_s", "rate_hz", "samples"), [

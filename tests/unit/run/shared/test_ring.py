@@ -213,7 +213,7 @@ def test_damaged_ring_is_survived(tmp_path_factory, garbage, at):
 def test_other_files_are_refused(tmp_path):
     path = tmp_path / "zeros"
     path.write_bytes(bytes(100_000))
-    with pytest.raises(ValueError, match="is not a hilctl ring"):
+    with pytest.raises(ValueError, match="hilctl ring"):
         SampleRing(path)
 
 
@@ -224,7 +224,7 @@ def test_other_files_are_refused(tmp_path):
 def test_sizes_that_can_not_be_are_refused(tmp_path, field, value):
     ring = make(tmp_path)
     ring.page.put(field, value)
-    with pytest.raises(ValueError, match=r"is damaged|is shorter than it says"):
+    with pytest.raises(ValueError, match=r"damaged|shorter"):
         SampleRing(ring.path)
 
 
