@@ -203,6 +203,13 @@ def model_problems(model: HysteresisModel | None, info: DeviceInfo) -> Iterator[
         yield broken("compensator.model", rule, model.input_unit)
 
 
+def finite_problems(low: float, high: float, unit: str) -> Iterator[ConfigProblem]:
+    """Yield that a run from ``low`` to ``high`` has commands that are no finite numbers."""
+    if not (math.isfinite(low) and math.isfinite(high)):
+        rule = "every command must be a finite number"
+        yield broken("compensator.model", rule, f"{low:.6g} to {high:.6g} {unit}")
+
+
 def identified_um(model: HysteresisModel | None, rests_um: float) -> tuple[float, float] | None:
     """Return the displacements that a model was identified on; None if they are unknown.
 

@@ -2,18 +2,16 @@
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Self
+from dataclasses import dataclass
+from typing import Annotated, Any, Literal, Self
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import ConfigProblem, broken
 from hilctl.base.strict import BeforeValidator, Field, model_validator
 from hilctl.base.types import CommandUnit
-from hilctl.experiment.coil_heat import CoolingCoil
-from hilctl.experiment.cures import SLOWER, Course, cure, fitting, rounded_up, smaller
 from hilctl.experiment.forecast import Forecast
 from hilctl.experiment.rig import RunRig
 from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
-from hilctl.waveforms.spec import AnyWaveform
 
 _ROUNDING = 1e-9  # of the range of commands
 _TRACKING_SHARE = 0.25  # of limits.stroke_um
@@ -164,12 +162,29 @@ def _unmet(
         yield f"needs a device that measures its command: {info.name} does not"
 
 
-def reference_problems(
-    limits: Limits,
-    waveform: AnyWaveform,
-    span: tuple[float, float],
-    identified: tuple[float, float] | None = None,
-) -> Iterator[ConfigProblem]:
+@dataclass(frozen=True, slots=True)
+class Excess:
+    """A limit that a run exceeds.
+
+    Attributes:
+        of: What exceeds it.
+        problem: The broken rule, without a cure.
+        amount: Excess, in ``unit``.
+        allowed: Lowest and highest permitted value.
+        at_s: Time from the start of the conditioning; NaN for the whole run.
+    """
+
+    of: Literal["reference", "command", "slew", "voltage", "heat"]
+    problem: ConfigProblem
+    amount: float
+    unit: str
+    allowed: tuple[float, float]
+    at_s: float = math.nan
+
+
+def reference_excess(
+    limits: Limits, span: tuple[float, float], identified: tuple[float, float] | None = None
+) -> Iterator[Excess]:
     """Yield the ranges that a reference in um with this span leaves.
 
     ``identified`` is the range that the model was identified on; None if it is unknown.
@@ -178,104 +193,48 @@ def reference_problems(
     if identified is not None:
         ranges["the range that compensator.model was identified on"] = identified
     for name, (lowest, highest) in ranges.items():
-        excess = max(lowest - span[0], span[1] - highest)
-        if excess > 0.0:
+        excess_um = max(lowest - span[0], span[1] - highest)
+        if excess_um > 0.0:
             rule = f"reference must stay within {name}, {lowest:g} to {highest:g} µm"
-            hint = f"{excess:.3g} µm too far: {fitting(waveform, span, (lowest, highest))}"
-            yield broken("waveform", rule, f"{span[0]:.6g} to {span[1]:.6g} µm", hint)
+            problem = broken("waveform", rule, f"{span[0]:.6g} to {span[1]:.6g} µm")
+            yield Excess("reference", problem, excess_um, "µm", (lowest, highest))
 
 
-def command_problems(limits: Limits, rig: RunRig, course: Course) -> Iterator[ConfigProblem]:
-    """Yield the limits that the commands of a run exceed, by how much, and when.
+def command_excess(limits: Limits, rig: RunRig, forecast: Forecast) -> Iterator[Excess]:
+    """Yield the limits that the commands of a run exceed; they must be finite.
 
     An excess below a step of the output is none: the limiter takes it away.
     """
-    forecast, unit = course.forecast, limits.unit
-    span = forecast.command_min, forecast.command_max
-    text = f"{span[0]:.6g} to {span[1]:.6g} {unit}"
-    if not all(map(math.isfinite, span)):
-        yield broken("compensator.model", "every command must be a finite number", text)
-        return
-    low, high = limits.command_range
-    if (excess := _excess(limits, forecast)) > rig.info.command_step:
-        at_s = forecast.lowest_at_s if low - span[0] == excess else forecast.highest_at_s
-        change = smaller(course, excess) or fitting(course.waveform, span, (low, high))
-        raised = _wider(limits, rig.info, forecast)
-        hint = cure(f"{excess:.3g} {unit}", course, at_s, change, raised)
+    unit, (low, high), slew_per_s = limits.unit, limits.command_range, limits.slew_per_s
+    if (excess := _beyond(limits, forecast)) > rig.info.command_step:
+        below = low - forecast.command_min == excess
         rule = f"the run must stay within {low:g} to {high:g} {unit}"
-        yield broken(f"limits.{limits.range_key}", rule, text, hint)
-    excess = forecast.slew_per_s - limits.slew_per_s
-    if excess > 0.0:
+        span = f"{forecast.command_min:.6g} to {forecast.command_max:.6g} {unit}"
+        problem = broken(f"limits.{limits.range_key}", rule, span)
+        at_s = forecast.lowest_at_s if below else forecast.highest_at_s
+        yield Excess("command", problem, excess, unit, (low, high), at_s)
+    if forecast.slew_per_s > slew_per_s:
+        rule = f"the run must change no faster than {slew_per_s:g} {unit}/s"
         key = f"limits.slew_{unit.lower()}_per_s"
-        raised = f"raise {key} to {rounded_up(forecast.slew_per_s):g}"
-        hint = cure(f"{excess:.3g} {unit}/s", course, forecast.fastest_at_s, SLOWER, raised)
-        rule = f"the run must change no faster than {limits.slew_per_s:g} {unit}/s"
-        yield broken(key, rule, f"{forecast.slew_per_s:.6g}", hint)
-    yield from _voltage_problems(rig, course)
-    yield from _budget_problems(limits, rig, course)
+        problem = broken(key, rule, f"{forecast.slew_per_s:.6g}")
+        excess, allowed = forecast.slew_per_s - slew_per_s, (-slew_per_s, slew_per_s)
+        yield Excess("slew", problem, excess, f"{unit}/s", allowed, forecast.fastest_at_s)
+    if rig.amplifier is not None and forecast.voltage_v is not None:
+        most_v = rig.amplifier.voltage_max_v
+        if (excess := forecast.voltage_v - most_v) > 0.0:
+            rule = f"the voltage of the run must be <= {most_v:g} V"
+            problem = broken("amplifier.voltage_max_v", rule, f"{forecast.voltage_v:.4g} V")
+            allowed = -most_v, most_v
+            yield Excess("voltage", problem, excess, "V", allowed, forecast.voltage_at_s)
+    used_s, rms_a, highest_a = forecast.budget_used_s, limits.rms_current_a, forecast.heating_rms_a
+    if used_s is not None and rms_a is not None and highest_a is not None:
+        time_s = limits.thermal_time_constant_s
+        rule = f"the coil must stay within {rms_a:g} A rms over {time_s:g} s"
+        problem = broken("limits.rms_current_a", rule, f"{highest_a:.4g} A")
+        yield Excess("heat", problem, highest_a - rms_a, "A", (0.0, rms_a), used_s)
 
 
-def _voltage_problems(rig: RunRig, course: Course) -> Iterator[ConfigProblem]:
-    forecast, amplifier = course.forecast, rig.amplifier
-    needed_v, at_s = forecast.voltage_v, forecast.voltage_at_s
-    if amplifier is None or needed_v is None or needed_v <= amplifier.voltage_max_v:
-        return
-    low, high = forecast.command_min, forecast.command_max
-    excess_v, change = needed_v - amplifier.voltage_max_v, SLOWER
-    if at_s < forecast.before_s:
-        change = "lower the condition's frequency_hz or amplitude_a"
-    elif max(-low, high) > amplifier.held_a:
-        held = f"{amplifier.voltage_max_v:g} V hold at most {amplifier.held_a:.4g} A"
-        change = f"lower amplitude or offset, because {held}"
-    elif at_s > forecast.before_s:  # not the step to the first command
-        # The voltage of the mean command does not decrease with the amplitude.
-        alternating_v = needed_v - amplifier.resistance_ohm * abs(0.5 * (low + high))
-        if less := smaller(course, 0.5 * (high - low) * excess_v / alternating_v):
-            change = f"lower the frequency, {less}"
-    raised = f"use an amplifier of {rounded_up(needed_v):g} V"
-    hint = cure(f"{excess_v:.3g} V", course, at_s, change, raised)
-    rule = f"the voltage of the run must be <= {amplifier.voltage_max_v:g} V"
-    yield broken("amplifier.voltage_max_v", rule, f"{needed_v:.4g} V", hint)
-
-
-def _budget_problems(limits: Limits, rig: RunRig, course: Course) -> Iterator[ConfigProblem]:
-    forecast = course.forecast
-    rms_a, highest_a, used_s = limits.rms_current_a, forecast.heating_rms_a, forecast.budget_used_s
-    if used_s is None or highest_a is None or rms_a is None:
-        return
-    left_s, safe = used_s - forecast.before_s, rig.command.safe
-    change = (
-        f"lower the waveform's amplitude or offset, or end it within {-rounded_up(-left_s):g} s"
-    )
-    if abs(safe) > rms_a:
-        change = "lower safe.value"
-    elif left_s <= 0.0:
-        change = "lower the condition's amplitude or cycles"
-    hint = cure(f"{highest_a - rms_a:.3g} A", course, used_s, change)
-    begins_a = forecast.begins_rms_a or 0.0
-    pause_s = CoolingCoil(rig, begins_a**2, 0.0).pause_s(forecast.heat, 0.0)
-    if pause_s > 0.0 and forecast.heat.hottest_a2 > safe**2:
-        hint = f"it begins at {begins_a:.3g} A rms, left by the last run: wait {pause_s:.0f} s"
-    rule = f"the coil must stay within {rms_a:g} A rms over {limits.thermal_time_constant_s:g} s"
-    yield broken("limits.rms_current_a", rule, f"{highest_a:.4g} A", hint)
-
-
-def _wider(limits: Limits, info: DeviceInfo, forecast: Forecast) -> str:
-    """Return the limit that a run needs, or that its device has no such range."""
-    low, high = limits.command_range
-    low = min(low, -rounded_up(-forecast.command_min))
-    high = max(high, rounded_up(forecast.command_max))
-    span = f"[{low!r}, {high!r}]"
-    if limits.peak_current_a is not None:
-        high = max(high, -low)
-        low, span = -high, f"{high:g}"
-    if info.command_min <= low and high <= info.command_max:
-        return f"raise limits.{limits.range_key} to {span} if the actuator allows it"
-    span = f"{info.command_min:g} to {info.command_max:g} {info.command_unit}"
-    return f"use a device with a larger range than {info.name}, {span}"
-
-
-def _excess(limits: Limits, forecast: Forecast) -> float:
+def _beyond(limits: Limits, forecast: Forecast) -> float:
     """Return by how much commands exceed their range; 0 for rounding errors."""
     low, high = limits.command_range
     excess = max(low - forecast.command_min, forecast.command_max - high)
@@ -284,7 +243,7 @@ def _excess(limits: Limits, forecast: Forecast) -> float:
 
 def clamp_warnings(limits: Limits, rig: RunRig, forecast: Forecast) -> tuple[str, ...]:
     """Return a warning if commands exceed their range by less than a step of the output."""
-    if not (excess := _excess(limits, forecast)):
+    if not (excess := _beyond(limits, forecast)):
         return ()
     return (
         f"limits.{limits.range_key}: commands exceed it by {excess:.2g} {limits.unit}, less than a "

@@ -7,7 +7,7 @@ in advance; the commands are compared with the limits.
 import logging
 from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
 
@@ -23,6 +23,7 @@ from hilctl.experiment.adaptation import (
 )
 from hilctl.experiment.compensator import (
     CompensatorStart,
+    finite_problems,
     identified_um,
     lead_in_problems,
     model_problems,
@@ -30,7 +31,7 @@ from hilctl.experiment.compensator import (
     start_problems,
 )
 from hilctl.experiment.conditioning import condition_problems, zero_problems
-from hilctl.experiment.cures import Course
+from hilctl.experiment.cures import Course, cured
 from hilctl.experiment.device_rules import (
     calibration_warnings,
     channel_problems,
@@ -41,11 +42,12 @@ from hilctl.experiment.device_state import heat_before, start_of
 from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.limits import (
+    Excess,
     clamp_warnings,
-    command_problems,
+    command_excess,
     interlock_problems,
     range_problems,
-    reference_problems,
+    reference_excess,
 )
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.model_validity import ExpectedError, RangeFindings, range_findings
@@ -116,10 +118,11 @@ class CheckedExperiment:
 
         ``bound`` is the forecast with the bounds of its commands.
         """
-        loaded = self.loaded
-        found = _span_problems(loaded, self.reference.unit, (low, high), _rest(loaded))
-        course = Course(loaded.config.waveform, bound)
-        return [*found, *command_problems(loaded.config.limits, loaded.rig, course)]
+        loaded, unit = self.loaded, self.reference.unit
+        found = [each.problem for each in _span_excess(loaded, unit, (low, high), _rest(loaded))]
+        commands = command_excess(loaded.config.limits, loaded.rig, bound)
+        invalid = finite_problems(bound.command_min, bound.command_max, bound.command_unit)
+        return found + ([*invalid] or [each.problem for each in commands])
 
 
 def check(
@@ -144,7 +147,6 @@ def check(
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder, rest)
     _warn_of_long_work(reference)
     findings = _findings(loaded, reference)
-    problems += _span_problems(loaded, reference.unit, reference.span, rest)
     problems += findings.refused
     with _refused(loaded, "compensator.model", problems):
         begun, unknown_start = start_of(loaded, reference, conditioned, now)
@@ -152,7 +154,8 @@ def check(
         left_a2, unknown_heat = heat_before(loaded, now)
         heat_a2 = config.safe.value**2 if heat_a2 is None else max(heat_a2, left_a2)
         forecast = _forecast(loaded, reference, begun, conditioned, heat_a2)
-    problems += _run_problems(loaded, reference, begun, forecast, rest)
+    course = Course(config.waveform, reference, forecast, config.limits, rig)
+    problems += _run_problems(loaded, course, begun, rest)
     if problems:
         for note in unknown_heat:
             _log.warning(note)
@@ -160,7 +163,7 @@ def check(
     operator = adapted_operator(config.adaptation_bounds, reference)
     for input_um in worst_inputs(operator, begun.input_um, rig.lead_in_samples):
         worst = forecast_of(rig, loaded.model, reference, begun, conditioned, input_um=input_um)
-        if found := _command_problems(loaded, worst, reference):
+        if found := _command_problems(replace(course, forecast=worst)):
             raise loaded.document.refusal(map(at_worst, found))
     warnings = (*findings.warnings, *_warnings(loaded, reference, forecast, now), *unknown_heat)
     return CheckedExperiment(
@@ -207,14 +210,12 @@ def _findings(loaded: LoadedExperiment, reference: Reference) -> RangeFindings:
     return range_findings(loaded.model.provenance, reference)
 
 
-def _span_problems(
+def _span_excess(
     loaded: LoadedExperiment, unit: str, span: tuple[float, float], rest: float
-) -> Iterator[ConfigProblem]:
+) -> Iterator[Excess]:
     """Yield the ranges of displacement that a reference with this span leaves."""
     if unit == "um":
-        identified = identified_um(loaded.model, rest)
-        config = loaded.config
-        yield from reference_problems(config.limits, config.waveform, span, identified)
+        yield from reference_excess(loaded.config.limits, span, identified_um(loaded.model, rest))
 
 
 def _forecast(
@@ -236,14 +237,11 @@ def _forecast(
 
 
 def _run_problems(
-    loaded: LoadedExperiment,
-    reference: Reference,
-    begun: CompensatorStart,
-    forecast: Forecast,
-    rest: float,
+    loaded: LoadedExperiment, course: Course, begun: CompensatorStart, rest: float
 ) -> Iterator[ConfigProblem]:
     """Yield the broken rules on the complete run."""
-    config, rig, model = loaded.config, loaded.rig, loaded.model
+    config, rig, model, reference = loaded.config, loaded.rig, loaded.model, course.reference
+    yield from cured(_span_excess(loaded, reference.unit, reference.span, rest), course)
     yield from mark_problems(config.trigger, reference.segments)
     if model is not None:
         yield from lead_in_problems(begun, rig, reference.values)
@@ -258,17 +256,16 @@ def _run_problems(
     )
     steps: list[ConfigProblem] = []
     if model is not None:
-        first, slew_per_s = forecast.first_command, forecast.slew_per_s
+        first, slew_per_s = course.forecast.first_command, course.forecast.slew_per_s
         steps += start_problems(begun, rig, config.waveform, rest, first, slew_per_s)
-    yield from steps or _command_problems(loaded, forecast, reference)
+    yield from steps or _command_problems(course)
 
 
-def _command_problems(
-    loaded: LoadedExperiment, forecast: Forecast, reference: Reference
-) -> list[ConfigProblem]:
-    config = loaded.config
-    course = Course(config.waveform, forecast, reference)
-    return [*command_problems(config.limits, loaded.rig, course)]
+def _command_problems(course: Course) -> list[ConfigProblem]:
+    low, high = course.forecast.command_min, course.forecast.command_max
+    return [*finite_problems(low, high, course.limits.unit)] or [
+        *cured(command_excess(course.limits, course.rig, course.forecast), course)
+    ]
 
 
 def _warnings(

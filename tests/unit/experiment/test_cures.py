@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hilctl.experiment.coil_heat import RunHeat
-from hilctl.experiment.cures import Course
-from hilctl.experiment.limits import command_problems
+from hilctl.experiment.cures import Course, cured
+from hilctl.experiment.limits import command_excess
 from tests.published import terfenol_rdpi
 from tests.unit.experiment.test_preflight import (
     CURRENT,
@@ -103,8 +103,9 @@ class TestBudget:
             checked(CURRENT).forecast, heating_rms_a=4.5, budget_used_s=1.5, before_s=1.5,
             begins_rms_a=begins_rms_a, heat=RunHeat(2.0, 1.0, hottest_a2),
         )  # fmt: skip
-        course = Course(made.config.waveform, forecast)
-        (problem,) = command_problems(made.config.limits, made.rig, course)
+        reference = checked(CURRENT).reference
+        course = Course(made.config.waveform, reference, forecast, made.config.limits, made.rig)
+        (problem,) = cured(command_excess(course.limits, course.rig, forecast), course)
         assert problem.key == "limits.rms_current_a"
         assert problem.value == "4.5 A"
         return problem.hint
