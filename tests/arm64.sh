@@ -66,6 +66,6 @@ inside 'for each in recordings/golden/*.mcap; do hilctl replay "$each"; done'
 step "a paced run of two seconds"
 # The emulated processor is slow, and its clock is this machine's: late ticks end nothing here.
 inside 'hilctl run configs/demo.yaml --output demo.mcap --set waveform.duration_s=2.0 \
-    --set timing.on_misses=warn --set timing.max_late_s=30.0
+    --set timing.max_missed_share=1 --set timing.max_late_s=30.0 --set timing.late_after=1e6
 hilctl replay demo.mcap'
 step "done"

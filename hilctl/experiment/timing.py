@@ -6,7 +6,7 @@ The guardian imports this module, so it must not import numba.
 import math
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Annotated, ClassVar, Literal
+from typing import Annotated, ClassVar
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.strict import Field, StrictModel
@@ -17,7 +17,7 @@ SHORTEST_TICK_S = 1e-4
 _ALWAYS_LATE_S = 2.0
 _MISSED_WINDOW_S = 10.0
 _SIMULATED_MARGIN_S = 0.5
-_HANG_S = 0.08
+_HANG_SHARE = 0.08  # of max_late_s, 1 s by default
 _STOPPED_S = 0.02
 
 
@@ -31,28 +31,27 @@ class Timing(StrictModel):
     Attributes:
         late_after: Delay in tick periods after which a tick counts as late.
         max_late_s: A tick later than this ends the run.
-        on_misses: Reaction to too many skipped ticks: ``fault`` ends the run with its safe ramp,
-            ``warn`` reports them after the run. The command is constant in a skipped tick and jumps
-            after it, so the output is no longer the checked waveform.
+            So does a longer silence of the loop: it is killed, and the output set to the safe
+            value. With real-time priority and a coil to protect the silence is at most 80 ms, or
+            8 % of ``max_late_s`` if that is more, and 20 ms of a stopped process (SIGSTOP).
+            ``max_late_s`` is added while the loop waits for the device.
         max_missed_share: Largest share of skipped ticks, over ten seconds or the whole waveform if
-            that is shorter; fewer than five stalls never end a run.
-        hang_s: A loop without heartbeat for this time and two tick periods is killed and the output
-            set to the safe value; ``max_late_s`` is added while it waits for the device. Default:
-            80 ms; ``max_late_s`` and half a second for a simulated device, which has no coil to
-            protect. A stopped process (SIGSTOP) is limited to 20 ms if there is a coil.
+            that is shorter; more end the run with its safe ramp, but fewer than five stalls never
+            do. The command is constant in a skipped tick and jumps after it, so the output is no
+            longer the checked waveform. 1: any number is only reported.
     """
 
     REMOVED: ClassVar[Mapping[str, str]] = {
         "late_policy": "removed: late ticks are skipped; delete the key",
         "max_consecutive_late": "removed: two seconds of late ticks end a run; set late_after",
-        "grace_s": "removed: set on_misses: warn, or a larger max_late_s",
+        "grace_s": "removed: set max_missed_share: 1, or a larger max_late_s",
+        "on_misses": "removed: set max_missed_share: 1 instead of warn; fault is the default",
+        "hang_s": "removed: set max_late_s, from which it follows",
     }
 
     late_after: Annotated[float, Field(gt=0.0)] = 0.5
     max_late_s: Annotated[float, Field(gt=0.0)] = 1.0
-    on_misses: Literal["warn", "fault"] = "fault"
-    max_missed_share: Annotated[float, Field(ge=0.0, lt=1.0)] = USUAL_MISSED_SHARE
-    hang_s: Annotated[float, Field(ge=0.02, le=60.0)] | None = None
+    max_missed_share: Annotated[float, Field(ge=0.0, le=1.0)] = USUAL_MISSED_SHARE
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,17 +102,16 @@ def late_rules(timing: Timing, tick_s: float, ticks: int) -> LateRules:
         max_late_ns=timing.max_late_s * 1e9,
         max_consecutive_late=math.ceil(_ALWAYS_LATE_S / tick_s),
         missed_window=max(1, window),
-        max_missed=timing.max_missed_share * window if timing.on_misses == "fault" else math.inf,
+        max_missed=timing.max_missed_share * window,
     )
 
 
 def silence_limits(timing: Timing, tick_s: float, *, simulated: bool) -> SilenceLimits:
     """Return the longest silence of the loop of an experiment."""
-    hang_s = ordinary_s = timing.hang_s
-    if hang_s is None or ordinary_s is None:
-        # Without real-time priority the loop may be as late as its own limit allows.
-        ordinary_s = timing.max_late_s + (_SIMULATED_MARGIN_S if simulated else 0.0)
-        hang_s = ordinary_s if simulated else min(_HANG_S, ordinary_s)
+    # Without real-time priority the loop may be as late as its own limit allows.
+    ordinary_s = hang_s = timing.max_late_s + (_SIMULATED_MARGIN_S if simulated else 0.0)
+    if not simulated:
+        hang_s = min(_HANG_SHARE * max(timing.max_late_s, 1.0), ordinary_s)
     periods_s = 2.0 * tick_s
     return SilenceLimits(
         real_time_s=periods_s + hang_s,

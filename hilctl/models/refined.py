@@ -1,7 +1,7 @@
 """A model with its identified residual, and the inverse of both: read from files of 0.2.0."""
 
 from collections.abc import Callable, Iterator
-from typing import Annotated, Any, Literal, TypeAlias
+from typing import Annotated, Any, Literal, Self, TypeAlias
 
 import numpy as np
 
@@ -161,6 +161,11 @@ class RefinedModel(HysteresisModel):
         return Chain(
             [operator, inverse], preview=inverse.preview, input_offset=-self.output_offset_um
         )
+
+    def earlier(self) -> Self | None:
+        """Return the model with the inverse of its base as of 0.2.0."""
+        base = self.base.earlier()
+        return None if base is None else self.model_copy(update={"base": base})
 
     def to_mapping(self) -> dict[str, Any]:
         """Return the parameters as plain mappings, lists and numbers, defaults omitted."""

@@ -48,7 +48,7 @@ EXPERIMENT: dict[str, Any] = {
     "condition": {"amplitude_a": 2.0, "frequency_hz": 5.0, "cycles": 3},
     "limits": {"peak_current_a": PEAK_A, "slew_a_per_s": 130.0, "stroke_um": [-120.0, 120.0]},
     "safe": {"value": 0.0, "ramp_s": RAMP_S},
-    "timing": {"on_misses": "warn"},  # a busy machine must not be quicker than the attack
+    "timing": {"max_missed_share": 1.0},  # a busy machine must not be quicker than the attack
     "recording": {"ring_s": 60.0, "flush_s": 0.5},
 }
 _DEVICE = {"sensor": {"um_per_v": 12.5}, "amplifier": {"gain_a_per_v": 1.0}, "watchdog": "none"}

@@ -25,7 +25,7 @@ EXPERIMENT = simulated(
     "process_fault",
     1000,
     sine(5.0, 60.0),
-    timing={"max_late_s": 3.0, "on_misses": "warn"},
+    timing={"max_late_s": 3.0, "max_missed_share": 1.0},
     recording={"flush_s": 0.1, "ring_s": 5.0},
 )
 

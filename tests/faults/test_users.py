@@ -19,7 +19,7 @@ from tests.faults.conftest import EXPERIMENT
 PATIENT = {
     "sample_rate_hz": 50,
     "waveform": {**EXPERIMENT["waveform"], "duration_s": 3600.0},
-    "timing": {"on_misses": "warn", "max_late_s": 30.0, "hang_s": 30.0},
+    "timing": {"max_missed_share": 1.0, "max_late_s": 30.0},
 }
 
 

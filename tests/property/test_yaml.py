@@ -230,7 +230,7 @@ waveform: {kind: sine, unit: A, amplitude: 1.0, frequency_hz: 5.0, duration_s: 0
 compensator: none
 limits: {peak_current_a: 2.0, slew_a_per_s: 500.0, stroke_um: [-75.0, 60.0]}
 safe: {value: 0.0, ramp_s: 0.1}
-timing: {on_misses: warn, max_late_s: 0.5}
+timing: {max_missed_share: 1, max_late_s: 0.5}
 recording: {flush_s: 0.1, ring_s: 2.0}
 """,
     """\

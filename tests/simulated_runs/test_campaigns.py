@@ -210,7 +210,7 @@ limits:
   rms_current_a: 2.5
   thermal_time_constant_s: 5.0
 recording: {flush_s: 0.2, ring_s: 2.0}
-timing: {on_misses: warn}
+timing: {max_missed_share: 1}
 """
 
 

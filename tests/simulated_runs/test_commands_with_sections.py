@@ -47,7 +47,7 @@ BAND = "first_hz: 10.0, last_hz: 100.0"
 INTEGRAL = "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 2.0}"
 PI = "feedback={limit_um: 5.0, ki_per_s: 20.0, %s}"
 WARM = "device.temperatures={coil_tau_s: 0.2}"
-TIMING = "{late_after: 0.9, max_late_s: 2.0, on_misses: warn, max_missed_share: 0.5, hang_s: 5.0}"
+TIMING = "{late_after: 0.9, max_late_s: 2.0, max_missed_share: 0.5}"
 RECORDING = "{folder: elsewhere, flush_s: 0.1, sync: true, scope_rate_hz: 100.0, ring_s: 1.0, "
 RECORDING += "on_failure: go_on}"
 

@@ -35,7 +35,7 @@ def ran(port, path, *more):
     rate = (
         "sample_rate_hz=2500",
         "waveform.duration_s=3.0",
-        "timing.hang_s=5.0",
+        "timing.max_late_s=30.0",
         "device.timeout_s=1.0",
     )
     changes = [f"device.tcp_port={port}", *rate, *more]

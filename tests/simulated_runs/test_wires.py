@@ -131,7 +131,7 @@ def write_experiment(path: Path, wire: Wire, device: dict[str, Any]) -> None:
         },
         "safe": {"value": 0.0, "ramp_s": 0.2},
         # A busy machine may miss deadlines; that must not end the run.
-        "timing": {"on_misses": "warn", "max_late_s": 5.0, "hang_s": 5.0},
+        "timing": {"max_missed_share": 1.0, "max_late_s": 5.0},
     }
     path.write_text(yaml.safe_dump(experiment), encoding="utf-8")
 
@@ -181,7 +181,7 @@ PIEZO = {
     "device.amplifier.gain_v_per_v": 10.0, "device.sensor.um_per_v": 5.0,
     "sample_rate_hz": 100.0, "limits.drive_v": "[0, 100]", "limits.slew_v_per_s": 1000.0,
     "limits.stroke_um": "[-5, 48]", "waveform.offset": 40.0, "waveform.amplitude": 40.0,
-    "timing.on_misses": "warn", "timing.max_late_s": 5.0, "timing.hang_s": 5.0,
+    "timing.max_missed_share": 1.0, "timing.max_late_s": 5.0,
 }  # fmt: skip
 
 

@@ -15,6 +15,7 @@ from hilctl.experiment import devices as registry
 from hilctl.experiment.file import Name
 from hilctl.experiment.limits import Interval
 from hilctl.experiment.load import load_experiment, resolve
+from hilctl.experiment.timing import Timing
 
 FULL = """\
 name: full_example
@@ -51,8 +52,7 @@ safe:
 timing:
   late_after: 0.25
   max_late_s: 2.0
-  on_misses: warn
-  hang_s: 0.5
+  max_missed_share: 0.5
 recording:
   folder: runs
   flush_s: 0.5
@@ -171,8 +171,16 @@ ONE_RULE = [
     ("stroke_um", "[-75.0, 60.0]", "[60.0, -75.0]", "limits.stroke_um"),
     ("stroke_um", "[-75.0, 60.0]", "[low, 60.0]", "limits.stroke_um.0"),
     ("value", "value: 0.5", "value: 7.1", "safe.value"),
-    ("on_misses", "on_misses: warn", "on_misses: hurry", "timing.on_misses"),
-    ("hang_s", "hang_s: 0.5", "grace_s: 0.5", "timing.grace_s"),
+    (
+        "max_missed_share",
+        "max_missed_share: 0.5",
+        "max_missed_share: 1.1",
+        "timing.max_missed_share",
+    ),
+    *(
+        ("max_missed_share", "max_missed_share: 0.5", f"{each}: 0.5", f"timing.{each}")
+        for each in Timing.REMOVED
+    ),
     ("scope_rate_hz", "scope_rate_hz: 500.0", "scope_rate_hz: 1001", "recording.scope_rate_hz"),
     ("ring_s", "ring_s: 20.0", "ring_s: 1.0", "recording"),
     ("seed", "seed: 3", "sed: 3", "device.sed"),
@@ -249,13 +257,13 @@ class TestSet:
                 "waveform.frequency_hz=20.0",
                 "limits.stroke_um.1=55.5",
                 "device.fault=null",
-                "timing={on_misses: fault}",
+                "timing={max_missed_share: 0}",
                 "name='7'",
             ),
         ).config
         assert (config.block, config.name, config.limits.stroke_um) == (10, "7", (-75.0, 55.5))
         assert config.waveform.model_dump()["frequency_hz"] == 20.0
-        assert config.timing.on_misses == "fault"
+        assert config.timing.max_missed_share == 0.0
         assert config.timing.late_after == 0.5
 
     @pytest.mark.parametrize(("setting", "key"), [
