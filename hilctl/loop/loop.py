@@ -109,9 +109,8 @@ class Loop:
                 cure = "set it with 'hilctl safe'; nothing has moved"
                 at = ", ".join(f"{each:g}" for each in outputs)
                 raise InputError(f"{rule}, but the output is at {at}: {cure}")
-            if triggers.marks.size:
-                device = cast(DigitalDevice, self._devices[0])
-                self._pulses = PulseOutput(device, triggers.marks + self._waveform_at)
+            device = cast(DigitalDevice, self._devices[0])
+            self._pulses = triggers.pulses(device, self._waveform_at)
         if self._waveform_at:
             self._phase = _STARTING if self._condition_at else _CONDITIONING
             self._pacer.policy = plan.start_policy

@@ -34,6 +34,10 @@ class Triggers:
     start: Level | None = None
     timeout_s: float = math.inf
 
+    def pulses(self, device: DigitalDevice, waveform_at: int) -> "PulseOutput | None":
+        """Return the digital output of a run, whose waveform begins at a sample; None without."""
+        return PulseOutput(device, self.marks + waveform_at) if self.marks.size else None
+
 
 def marks_of(kind: MarkKind | None, segments: Iterable[Segment]) -> I64:
     """Return the first samples of the waveform, its segments or their cycles, int64[m]."""
