@@ -44,23 +44,7 @@ def trips(limits, n, **columns):
     return trip, bench
 
 
-@pytest.mark.parametrize("columns", [
-    {"command": 2.0},
-    {"command": 2.0, "measured": 1e9},
-    {"command": 1e6},
-    {"reference": 1e9, "displacement": 1.0},
-])  # fmt: skip
-def test_interlocks_are_off_without_a_limit(columns):
-    assert trips(STROKE, 1000, **columns)[0] is None
-
-
 class TestStroke:
-    @pytest.mark.parametrize("value", [-60.0, 0.0, 50.0])
-    def test_within(self, value):
-        trip, bench = trips(STROKE, 3, displacement=value)
-        assert trip is None
-        assert not bench.flags.any()
-
     @pytest.mark.parametrize(
         ("value", "shown"),
         [(-60.001, "-60"), (50.001, "50"), (77.7, "77.7"), (np.inf, "inf")],
@@ -70,11 +54,6 @@ class TestStroke:
         reason = f"displacement {shown} µm at sample 101 is outside the stroke limits -60 to 50 µm"
         assert trip == Trip(101, "stroke", reason)
         assert bench.flagged(Flag.SENSOR_INVALID) == [1, 3]
-
-    def test_sensor_without_ends(self):
-        limits = RigInterlocks(stroke_um=(-1.0, 2.0))
-        assert trips(limits, 1, displacement=np.inf)[0].code == "stroke"
-        assert trips(limits, 1, displacement=-np.inf)[0].code == "stroke"
 
 
 class TestAux:
@@ -127,35 +106,10 @@ class TestAux:
 class TestMissing:
     LIMITS = replace(STROKE, sensor_invalid_s=0.003, measured_deviation_a=0.1)
 
-    def test_ends_a_run_by_default(self):
-        trip, bench = trips(STROKE, 4, first=100, displacement=[1.0, np.nan, 2.0, np.nan])
-        assert (trip.sample, trip.code) == (101, "sensor_invalid")
-        assert bench.flagged(Flag.SENSOR_INVALID) == [1, 3]
-
-    @pytest.mark.parametrize(("missing", "sample"), [(3, None), (4, 14)])
-    def test_trips_after_its_time(self, missing, sample):
-        readings = np.ones(30)
-        readings[[1, *range(11, 11 + missing)]] = np.nan
-        trip, bench = trips(
-            replace(self.LIMITS, measured_deviation_a=None), 30, displacement=readings
-        )
-        assert (trip and (trip.sample, trip.code)) == (sample and (sample, "sensor_invalid"))
-        assert bench.flagged(Flag.SENSOR_INVALID) == [1, *range(11, 11 + missing)]
-
-    def test_a_permitted_one_does_not_hide_another_reason(self):
-        columns = {"measured": [0.0, 5.0], "displacement": [0.0, np.nan]}
-        assert trips(self.LIMITS, 2, **columns)[0].code == "deviation"
-
     def test_skipped_samples_count(self):
         bench = Fed(self.LIMITS)
         assert bench.feed(1, measured=0.0, displacement=np.nan) is None
         assert bench.feed(1, first=9, measured=0.0, displacement=np.nan).code == "sensor_invalid"
-
-    def test_neither_ends_nor_continues_other_times(self):
-        limits = replace(self.LIMITS, tracking_error_um=1.0, tracking_s=0.002)
-        readings = [5.0, np.nan, 5.0, np.nan, 5.0]
-        trip, _ = trips(limits, 5, displacement=readings, reference=0.0, measured=0.0)
-        assert (trip.sample, trip.code) == (4, "tracking_error")
 
 
 class TestSensorRange:
@@ -166,12 +120,6 @@ class TestSensorRange:
         assert trip.sample == 2
         assert f"{rail:g} µm" in trip.reason
         assert bench.flagged(Flag.SENSOR_INVALID) == [2]
-
-    @pytest.mark.parametrize("rail", [-100.0, 100.0])
-    def test_stroke_as_wide_as_the_sensor(self, rail):
-        limits = replace(STROKE, stroke_um=(-100.0, 100.0))
-        assert trips(limits, 1, displacement=rail)[0].code == "sensor_range"
-        assert trips(limits, 1, displacement=np.nextafter(rail, 0.0))[0] is None
 
     def test_a_zero_shifts_the_range_and_not_the_stroke(self):
         bench = Fed(STROKE)
@@ -196,65 +144,15 @@ class TestFrozen:
         )
         assert bench.flagged(InterlockFlag.SENSOR_FROZEN) == list(range(30, 60))
 
+    def test_travel_of_exactly_the_limit_does_not_count(self):
+        still = np.zeros(50)
+        assert trips(FROZEN, 100, command=np.concatenate((still, still - 0.5)))[0] is None
+        assert trips(FROZEN, 100, command=np.concatenate((still, still - 0.51)))[0].sample == 60
+
     def test_names_the_unit(self):
         limits = replace(FROZEN, unit="V")
         trip, _ = trips(limits, 60, command=np.arange(60.0), displacement=1.0)
         assert "moved by 0.5 V" in trip.reason
-
-    def test_exactly_that_far_is_not_far_enough(self):
-        still = np.zeros(50)
-        assert trips(FROZEN, 100, command=np.concatenate((still, still + 0.5)))[0] is None
-        assert trips(FROZEN, 100, command=np.concatenate((still, still - 0.5)))[0] is None
-        assert trips(FROZEN, 100, command=np.concatenate((still, still - 0.51)))[0].sample == 60
-
-    def test_travel_is_from_lowest_to_highest(self):
-        command = np.concatenate((np.zeros(5), np.full(5, 0.3), np.full(40, -0.3)))
-        assert trips(FROZEN, 50, command=command)[0].sample == 20
-
-    def test_hold_never_trips(self):
-        assert trips(FROZEN, 5000, command=3.0)[0] is None
-
-    def test_travel_starts_at_the_first_command(self):
-        """An output that rests away from 0, with a reading of exactly 0, has not travelled."""
-        assert trips(replace(FROZEN, safe=3.0), 500, command=3.0, displacement=0.0)[0] is None
-
-    def test_step_out_of_a_long_hold(self):
-        command = np.concatenate((np.zeros(500), np.full(500, 4.0)))
-        reading = np.concatenate((np.zeros(510), np.full(490, 30.0)))
-        assert trips(FROZEN, 1000, command=command, displacement=reading)[0] is None
-        late = np.concatenate((np.zeros(511), np.full(489, 30.0)))
-        assert trips(FROZEN, 1000, command=command, displacement=late)[0].sample == 510
-
-    def test_change_starts_everything_anew(self):
-        command = np.concatenate((np.zeros(20), np.full(40, 0.6)))
-        reading = np.full(60, 5.0)
-        reading[25:] = np.nextafter(5.0, 6.0)
-        assert trips(FROZEN, 60, command=command, displacement=reading)[0] is None
-        command[40:] = 0.0
-        assert trips(FROZEN, 60, command=command, displacement=reading)[0].sample == 50
-
-    def test_travel_before_a_change_does_not_count(self):
-        command = np.linspace(0.0, 30.0, 61)
-        reading = np.full(61, 1.0)
-        reading[:30] = np.arange(30.0)
-        reading[30:] = 29.5
-        trip, _ = trips(FROZEN, 61, command=command, displacement=reading)
-        assert trip.sample == 42  # 30: the change; 32: more than 0.5 A from it; and 10 samples
-
-    def test_resolution(self):
-        limits = replace(FROZEN, frozen_um=0.25)
-        command = np.arange(100.0)
-        flicker = 1.0 + 0.25 * (np.arange(100) % 2)
-        assert trips(limits, 100, command=command, displacement=flicker)[0].sample == 11
-        wider = 1.0 + 0.26 * (np.arange(100) % 2)
-        assert trips(limits, 100, command=command, displacement=wider)[0] is None
-        creep = 1.0 + 0.1 * np.arange(100)
-        assert trips(limits, 100, command=command, displacement=creep)[0] is None
-
-    def test_invalid_readings_are_not_frozen(self):
-        trip, bench = trips(FROZEN, 100, command=np.arange(100.0), displacement=np.nan)
-        assert trip.code == "sensor_invalid"
-        assert bench.flagged(InterlockFlag.SENSOR_FROZEN) == []
 
 
 DEVIATION = replace(STROKE, measured_deviation_a=0.5, deviation_s=0.003)
@@ -269,11 +167,6 @@ class TestDeviation:
             assert number in trip.reason
         assert bench.flagged(InterlockFlag.DEVIATION) == list(range(13, 20))
 
-    @pytest.mark.parametrize("measured", [1.5, 2.0, 2.5])
-    def test_within(self, measured):
-        limits = replace(DEVIATION, safe=2.0, deviation_s=0.0)
-        assert trips(limits, 50, command=2.0, measured=measured)[0] is None
-
     @pytest.mark.parametrize("measured", [1.49, 2.51, np.nan, np.inf, -np.inf])
     def test_beyond_without_a_time(self, measured):
         limits = replace(DEVIATION, safe=2.0, deviation_s=0.0, unit="V")
@@ -281,35 +174,11 @@ class TestDeviation:
         assert trip.sample == 7
         assert f"{measured:.4g} V" in trip.reason
 
-    def test_either_command_may_be_measured(self):
-        limits = replace(DEVIATION, deviation_s=0.0)
-        command = np.array([0.0, 5.0, -5.0, 5.0])
-        for measured in (command, np.array([0.0, 0.0, 5.0, -5.0]), np.array([0.0, 2.0, -5.5, 5.5])):
-            assert trips(limits, 4, command=command, measured=measured)[0] is None
-            bench = Fed(limits)
-            for k in range(4):
-                assert bench.feed(1, first=k, command=command[k], measured=measured[k]) is None
-        trip, _ = trips(limits, 4, command=command, measured=np.array([0.0, 2.0, 5.6, 0.0]))
-        assert trip.reason.startswith("measured 5.6 A at sample 2, with a command of 5 to -5 A")
-        bench = Fed(limits)
-        bench.feed(1, command=5.0, measured=0.0)
-        trip = bench.feed(1, first=1, command=-5.0, measured=-5.6)
-        assert trip.reason.startswith("measured -5.6 A at sample 1, with a command of 5 to -5 A")
-
     def test_starts_from_the_output_that_is_found(self):
         bench = Fed(replace(STROKE, measured_deviation_a=0.1))
         bench.interlocks.begin_at(3.0)
         assert bench.feed(1, command=2.9, measured=3.05) is None
         assert Fed(replace(STROKE, measured_deviation_a=0.1)).feed(1, command=2.9, measured=3.05)
-
-    def test_starts_from_the_safe_value(self):
-        limits = replace(DEVIATION, safe=-1.0, deviation_s=0.0)
-        assert trips(limits, 1, command=1.0, measured=-1.4)[0] is None
-        assert trips(limits, 1, command=1.0, measured=-1.6)[0].code == "deviation"
-
-    def test_back_in_time_starts_anew(self):
-        measured = np.tile([9.0, 9.0, 9.0, 0.0], 50)
-        assert trips(DEVIATION, 200, command=0.0, measured=measured)[0] is None
 
 
 THERMAL = replace(STROKE, rms_current_a=2.0, thermal_time_constant_s=0.1)
@@ -333,21 +202,6 @@ class TestThermal:
         assert trips(replace(THERMAL, safe=2.0), 20, command=2.0)[0] is None
         assert trips(THERMAL, 20_000, command=2.001)[0] is not None
 
-    def test_sine_is_judged_by_its_rms(self):
-        sine = np.sin(2.0 * np.pi * 200.0 * np.arange(5000) / RATE_HZ)
-        assert trips(THERMAL, 5000, command=2.75 * sine)[0] is None
-        assert trips(THERMAL, 5000, command=2.9 * sine)[0].code == "thermal"
-
-    @pytest.mark.parametrize(("command", "measured"), HEATING)
-    def test_the_larger_of_commanded_and_measured(self, command, measured):
-        trip, _ = trips(THERMAL, 100, command=command, measured=measured)
-        assert trip.sample == trips(THERMAL, 100, command=3.0)[0].sample
-
-    def test_starts_at_the_heat_of_the_safe_value(self):
-        rested = replace(THERMAL, safe=-1.0)
-        trip, _ = trips(rested, 100, command=3.0)
-        assert trip.sample == math.ceil(0.1 * RATE_HZ * math.log(8.0 / 5.0)) - 1
-
     def test_starts_at_the_heat_that_the_last_run_has_left(self):
         hot = replace(THERMAL, heat_a2=3.99)
         assert trips(hot, 5, command=2.9)[0].code == "thermal"
@@ -359,11 +213,6 @@ class TestThermal:
         bench = Fed(THERMAL)
         bench.interlocks.begin_at(3.0)
         assert bench.feed(5).code == "thermal"
-
-    def test_budget_is_the_square_of_the_rms(self):
-        limits = replace(THERMAL, rms_current_a=3.0)
-        assert trips(limits, 5000, command=3.0)[0] is None
-        assert trips(limits, 5000, command=3.01)[0] is not None
 
 
 TRACKING = replace(STROKE, tracking_error_um=2.0, tracking_s=0.005)
@@ -386,14 +235,6 @@ class TestTracking:
         assert trips(limits, 9, reference=-1.0, displacement=1.0)[0] is None
         trip, _ = trips(limits, 9, reference=3.01, displacement=1.0)
         assert trip.reason == "tracking error 2.01 µm at sample 0 is beyond 2 µm"
-
-    def test_back_in_time_starts_anew(self):
-        reference = np.tile([9.0] * 5 + [1.0], 50)
-        assert trips(TRACKING, 300, reference=reference, displacement=1.0)[0] is None
-
-    def test_without_a_reference_there_is_no_error(self):
-        reference = np.array([9.0] * 5 + [np.nan] + [9.0] * 5 + [np.nan] * 50)
-        assert trips(TRACKING, 61, reference=reference, displacement=1.0)[0] is None
 
 
 EVERYTHING = replace(
@@ -426,12 +267,6 @@ class TestSeveral:
         assert told == [
             "sensor_invalid", "sensor_frozen", "deviation", "thermal", "tracking_error",
         ]  # fmt: skip
-
-    def test_the_first_sample_counts(self):
-        reference = np.array([0.0, 9.0, 0.0])
-        displacement = np.array([0.0, 0.0, np.nan])
-        trip, _ = trips(EVERYTHING, 3, reference=reference, displacement=displacement, measured=0.0)
-        assert (trip.sample, trip.code) == (1, "tracking_error")
 
     def test_conditions_that_last_are_told_in_every_block(self):
         bench = Fed(STROKE)
@@ -504,11 +339,3 @@ def test_rig_that_means_nothing_is_refused(field, value, text):
     with pytest.raises(InputError) as caught:
         replace(STROKE, **{field: value}).made(RATE_HZ)
     assert str(caught.value) == text
-
-
-def test_smallest_limits_hold():
-    limits = replace(
-        STROKE, measured_deviation_a=1e-9, tracking_error_um=1e-9, frozen_um=0.0, safe=1.0
-    )
-    assert trips(limits, 5, command=1.0, measured=1.0, reference=1.0)[0] is None
-    assert trips(limits, 5, command=1.0, measured=1.1)[0].code == "deviation"
