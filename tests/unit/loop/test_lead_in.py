@@ -19,45 +19,12 @@ def short_conditioning(**options):
     return Conditioning(COMMAND, rest=(30, 40), cycle_samples=20, **options)
 
 
-def test_nothing_before():
-    beginning, input_um = LeadIn(None, 0), np.ones(3)
-    assert (beginning.condition_at, beginning.waveform_at) == (0, 0)
-    assert beginning.condition_event() is None
-    beginning.take(0, np.ones(3))
-    assert beginning.remove_offset() == ("", {}, False)
-    beginning.correct(input_um, 0)
-    assert input_um.tolist() == [1.0, 1.0, 1.0]
-
-
 def test_invalid_readings_at_rest_are_left_out():
     beginning = LeadIn(short_conditioning(), 0)
     for first, readings in [(30, [np.nan, np.nan]), (32, [1.0, 3.0]), (34, [np.nan, 2.0])]:
         beginning.take(first, np.array(readings))
     assert beginning.resting_um == pytest.approx(2.0)
     assert math.isfinite(beginning.noise_um)
-
-
-def test_parts_follow_one_another():
-    beginning, wanted = LeadIn(short_conditioning(), 10), np.empty(5)
-    assert (beginning.condition_at, beginning.waveform_at) == (10, 50)
-    beginning.condition(wanted, 17)
-    assert wanted.tolist() == COMMAND[7:12].tolist()
-    ramp, event = beginning.ramp_event(4.0, 0.0), beginning.condition_event()
-    assert (ramp.sample, ramp.values) == (0, {"output": 4.0, "samples": 10.0})
-    assert event is not None
-    assert (event.sample, event.values) == (10, {"cycle_samples": 20.0, "samples": 40.0})
-
-
-@pytest.mark.parametrize(("largest_um", "left_um"), [(5.0, -3.0), (2.0, 0.0)])
-def test_offset_within_the_limit_is_taken_out(largest_um, left_um):
-    beginning = LeadIn(short_conditioning(stands_um=1.0, largest_um=largest_um), 10)
-    beginning.take(35, np.full(20, 4.0))
-    _, values, refused = beginning.remove_offset()
-    assert values == {"offset_um": 3.0, "resting_um": 4.0, "model_um": 1.0}
-    assert refused == (left_um == 0.0)
-    input_um = np.zeros(2)
-    beginning.correct(input_um, 100)
-    assert input_um.tolist() == [left_um, left_um]
 
 
 CYCLE = np.concatenate((2.0 * np.sin(np.arange(100) * np.pi / 25.0), np.zeros(40)))

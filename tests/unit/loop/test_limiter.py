@@ -72,14 +72,6 @@ class TestFromElsewhere:
         assert (np.diff(np.abs([start - 0.5, *(command - 0.5)])) < 0.0).all()
         assert samples == np.ceil(round(abs(start - 0.5) / 0.05, 6))
 
-    @pytest.mark.parametrize(("start", "samples"), [(0.5, 0), (0.549, 0), (0.451, 0), (0.551, 2)])
-    def test_what_one_step_of_it_reaches_needs_no_ramp(self, start, samples):
-        limiter = Limiter(LIMITS, DT_S)
-        limiter.last = start
-        assert limiter.ramp_samples == samples
-        assert limiter.at_rest == (samples == 0)
-        assert abs(limited(limiter, [3.0])[0][0] - start) <= LIMITS.slew_per_s * DT_S * (1 + 1e-9)
-
     @pytest.mark.parametrize("wish", [np.nan, -1e9, 0.0, 1e9])
     @pytest.mark.parametrize("start", [-9.0, 9.0])
     def test_no_wish_jumps_from_outside(self, start, wish):

@@ -30,7 +30,7 @@ def text_of(diagnosis):
     return console.file.getvalue()
 
 
-def test_report_has_all_of_it():
+def test_report_has_all_findings():
     findings = (Finding("kernel", "warn", "PREEMPT_DYNAMIC [none]", "install another"),)
     shown = text_of(Diagnosis(findings, latency([3000, 5000, 2 * MS])))
     for part in ("PREEMPT_DYNAMIC [none]", "-> install another", "refused", "-> rtprio",
@@ -74,14 +74,14 @@ def limits(rtprio: str, memlock: str) -> dict[str, str]:
     return {"/proc/self/limits": text}
 
 
-def test_a_good_machine_has_nothing_to_mend(make_machine):
+def test_good_machine_has_no_remedies(make_machine):
     found = examine(make_machine(), Realtime(), Path())
     assert {each.level for each in found} == {"ok"}
     assert {each.remedy for each in found} == {""}
     assert len({each.name for each in found}) == len(found) == 15
 
 
-def test_every_trouble_has_a_remedy(make_machine):
+def test_every_problem_has_a_remedy(make_machine):
     machine = make_machine(
         {
             "/proc/version": "Linux version 6.1 #1 SMP PREEMPT_DYNAMIC",
@@ -168,7 +168,7 @@ SLOW_FTDI = {"/sys/bus/usb-serial/devices/ttyUSB1/latency_timer": "16"}
         (checks.serial_daemons, daemons("brltty", "ModemManager"), "warn", "brltty", "brltty"),
     ],
 )  # fmt: skip
-def test_what_a_check_finds(make_machine, check, files, level, said, remedy):
+def test_findings_of_each_check(make_machine, check, files, level, said, remedy):
     found = check(make_machine(files))
     assert found.level == level
     assert said in found.text
@@ -232,7 +232,7 @@ def login(monkeypatch):
     ({"/proc/self/status": "Uid:\t0\t0\t0\t0"}, "ok"),
     ({"/run/systemd/system/x": None}, "ok"),
 ])  # fmt: skip
-def test_what_logind_is_set_to(make_machine, login, files, level):
+def test_settings_of_logind_are_evaluated(make_machine, login, files, level):
     found = checks.log_out(make_machine({**SYSTEMD, **files}))
     assert found.level == level
     assert bool(found.remedy) == (level == "warn")

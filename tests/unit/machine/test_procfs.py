@@ -27,7 +27,7 @@ def written(tmp_path):
     return make
 
 
-def test_absent_files_say_nothing_and_raise_nothing(written):
+def test_missing_files_raise_nothing(written):
     machine = written()
     assert machine.text("/proc/version") is None
     assert machine.number("/proc/version") is None
@@ -51,7 +51,7 @@ def test_capabilities_are_bits_of_this_process(written):
     assert not machine.capable(23)
 
 
-def test_limits_are_soft_ones(written):
+def test_limits_are_the_soft_limits(written):
     machine = written(self__limits=LIMITS)
     assert machine.limit("Max locked memory") == 8388608
     assert machine.limit("Max realtime priority") is None
@@ -79,6 +79,6 @@ def test_pages_and_time_are_counted():
     assert after.resident_bytes - before.resident_bytes >= PAGES * mmap.PAGESIZE // 2
 
 
-def test_the_difference_is_of_all_that_adds_up():
+def test_usage_is_a_difference_of_counters():
     before, after = ProcessUsage(9, 10, 20, 30, 40), ProcessUsage(7, 11, 22, 33, 44)
     assert after.since(before) == ProcessUsage(7, 1, 2, 3, 4)

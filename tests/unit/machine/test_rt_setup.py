@@ -122,7 +122,7 @@ def test_memory_is_locked_only_if_later_allocations_fit(lockable, outcome):
     ("isolated", "cpu", "pinned"),
     [("3\n", None, 3), ("2-3,6\n", None, 2), ("\n", None, None), ("3\n", 1, 1)],
 )
-def test_the_experiments_cpu_goes_before_the_first_isolated_one(isolated, cpu, pinned):
+def test_cpu_of_the_experiment_precedes_the_first_isolated_one(isolated, cpu, pinned):
     system = FakeSystem(files={ISOLATED: isolated})
     step = by_name(prepare(Realtime(cpu=cpu), system))["cpu"]
     asked = [asked[1] for asked in system.asked if asked[0] == "pin"]
@@ -157,7 +157,7 @@ def test_share_of_the_control_group(files, share):
     assert rt_group_runtime_us(FakeSystem(files=files).read) == share
 
 
-def test_a_run_that_requires_real_time():
+def test_required_real_time_is_refused_with_all_remedies():
     require(prepare(Realtime(), FakeSystem(refuses={"hold_dma_latency", "set_timer_slack"})))
     refused = prepare(Realtime(), FakeSystem(refuses={"set_fifo", "lock_memory"}))
     with pytest.raises(InputError, match="rtprio") as raised:
@@ -175,14 +175,14 @@ def test_facts_name_each_step():
 
 
 @pytest.mark.parametrize("policy", [os.SCHED_FIFO, os.SCHED_RR, os.SCHED_OTHER])
-def test_an_inherited_policy_is_given_up(policy):
+def test_inherited_real_time_policy_is_dropped(policy):
     system, inherited = FakeSystem(policy_now=policy), policy != os.SCHED_OTHER
     assert be_ordinary(system) == inherited
     assert system.asked == [("set_ordinary",)] * inherited
 
 
 @pytest.mark.parametrize("before", [0, 10, -15])
-def test_beside_a_real_time_loop_a_thread_is_favoured_for_a_while(before):
+def test_thread_has_priority_beside_a_real_time_loop(before):
     system = FakeSystem(policies={7: os.SCHED_FIFO}, nice_now=before)
     with favoured(7, system):
         assert system.nice_now == min(before, -10)
@@ -194,7 +194,7 @@ def test_beside_a_real_time_loop_a_thread_is_favoured_for_a_while(before):
     FakeSystem(policies={7: os.SCHED_FIFO}, refuses={"set_nice"}),
     FakeSystem(),
 ], ids=["the loop is ordinary", "it is not allowed", "the loop is gone"])  # fmt: skip
-def test_otherwise_nothing_changes(system):
+def test_priority_is_unchanged_without_a_real_time_loop(system):
     with favoured(7, system):
         assert system.nice_now == 0
     assert system.nice_now == 0
@@ -232,7 +232,7 @@ def real():
     return json.loads(ended([sys.executable, "-c", REAL]).stdout)
 
 
-def test_what_is_said_to_be_done_is_done(real):
+def test_reported_steps_are_done(real):
     done = {step["name"] for step in real["steps"] if step["outcome"] == "done"}
     assert {"gc", "prefault", "cpu"} <= done
     assert not real["during"]["gc"]

@@ -20,7 +20,7 @@ def process():
     gc.enable()
 
 
-def test_an_error_of_the_system_is_raised_with_its_number(process):
+def test_system_error_has_its_number(process):
     with pytest.raises(OSError, match="descriptor") as error:
         process._call("close", -1)
     assert error.value.errno == errno.EBADF
@@ -32,13 +32,13 @@ def test_a_pinned_process_has_one_cpu(process):
     assert os.sched_getaffinity(0) == {cpu}
 
 
-def test_garbage_is_collected_no_more(process):
+def test_garbage_collection_is_disabled(process):
     process.freeze_gc()
     assert not gc.isenabled()
     assert gc.get_freeze_count() > 0
 
 
-def test_idle_states_are_held_off_as_long_as_the_file_is_open(process, tmp_path, monkeypatch):
+def test_idle_states_are_prevented_while_the_file_is_open(process, tmp_path, monkeypatch):
     held = tmp_path / "cpu_dma_latency"
     held.touch()
     monkeypatch.setattr(syscalls, "DMA_LATENCY", str(held))

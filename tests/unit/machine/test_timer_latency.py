@@ -29,13 +29,13 @@ def latency(late_ns, rate_hz=1000.0):
     ([5 * MS, 5 * MS, 5 * MS], 1 * MS, True),
     ([3 * MS, 0, 0], 1 * MS, True),
 ])  # fmt: skip
-def test_no_period_may_be_over_twice_the_nominal_one(late_ns, longest_ns, kept):
+def test_rate_is_kept_if_no_period_is_twice_the_nominal_one(late_ns, longest_ns, kept):
     found = latency(late_ns)
     assert found.longest_period_ns == longest_ns
     assert found.kept == kept
 
 
-def test_rate_that_would_have_been_kept():
+def test_highest_rate_that_would_be_kept():
     late_ns = [0, 4 * MS, 2 * MS, 0]
     rate_hz = latency(late_ns).kept_rate_hz
     assert rate_hz == pytest.approx(250.0)
@@ -62,7 +62,7 @@ def test_every_wake_up_is_counted_once():
     ("catch_up", [10, 2_500_000, 1_500_010, 500_020, 10]),
     ("skip", [10, 2_500_000, 10, 10, 10]),  # a stall counts once, as with cyclictest
 ])  # fmt: skip
-def test_lateness_is_the_pacers(policy, expected):
+def test_lateness_is_that_of_the_pacer(policy, expected):
     wanted = [10, 2_500_000, 10, 10, 10]
     clock, late_ns = FakeClock(stall_ns=dict(enumerate(wanted))), np.zeros(5, dtype=np.int64)
     watch(Pacer(clock, 1e6, policy, LateRules(1e6)), late_ns, clock, lambda: True)
@@ -76,7 +76,7 @@ def test_measuring_ends_with_the_parent():
     assert np.count_nonzero(late_ns) == 3
 
 
-def test_measuring_ends_far_behind():
+def test_measuring_ends_if_it_is_far_behind():
     clock, late_ns = FakeClock(), np.zeros(1000, dtype=np.int64)
     clock.sleep_until_ns = lambda _: setattr(clock, "now", clock.now + 3_000_000)
     ticks = watch(Pacer(clock, 1e6, "catch_up", LateRules(1e6)), late_ns, clock, lambda: True)
@@ -85,13 +85,13 @@ def test_measuring_ends_far_behind():
 
 
 @pytest.mark.parametrize("rate_hz", [0.0, -1.0, 20_001.0, float("nan")])
-def test_rates_beyond_measure_are_refused(rate_hz):
+def test_rates_outside_the_range_are_refused(rate_hz):
     """A rate that Python alone could not keep is refused, not measured."""
     with pytest.raises(InputError, match="rate must be"):
         measure(rate_hz, 0.1, Realtime())
 
 
-def test_measured_in_a_process_of_its_own():
+def test_latency_is_measured_in_a_subprocess():
     seen = []
     found = measure(500.0, 0.2, Realtime(), seen.append)
     assert found.late_ns.size == 100
@@ -100,13 +100,13 @@ def test_measured_in_a_process_of_its_own():
     assert seen
 
 
-def test_a_process_that_fails_is_told(monkeypatch):
+def test_failure_of_the_subprocess_is_an_error(monkeypatch):
     monkeypatch.setattr(sys, "executable", "/bin/false")
     with pytest.raises(RunError, match="exit code 1"):
         measure(500.0, 0.1, Realtime())
 
 
-def test_a_process_that_hangs_is_ended(monkeypatch, tmp_path):
+def test_hanging_subprocess_is_ended(monkeypatch, tmp_path):
     stuck = tmp_path / "stuck"
     stuck.write_text("#!/bin/sh\nexec sleep 60\n")
     stuck.chmod(0o700)
@@ -116,7 +116,7 @@ def test_a_process_that_hangs_is_ended(monkeypatch, tmp_path):
         measure(500.0, 0.05, Realtime())
 
 
-def test_command_line(monkeypatch, capsys):
+def test_exit_codes_of_doctor(monkeypatch, capsys):
     from typer.testing import CliRunner
 
     from hilctl.cli.commands import app

@@ -20,7 +20,7 @@ RECORDS = [
 
 
 @pytest.mark.parametrize(("opcode", "record"), RECORDS)
-def test_only_exactly_one_record_is_whole(opcode, record):
+def test_record_must_fill_its_bytes_exactly(opcode, record):
     body = raw(record)[9:]
     assert parse(opcode, body) == record
     assert parse(opcode, body[:-1]) is None
@@ -35,7 +35,7 @@ def test_an_attachment_has_a_checksum():
     assert parse(Opcode.ATTACHMENT, bytes(body)) is None
 
 
-def test_a_chunk_must_be_records_to_its_last_byte():
+def test_chunk_must_consist_of_whole_records():
     data = raw(message(1)) + raw(message(2))
     found = contents(chunk(data), ReadBudget(2**20))
     assert found.records == (message(1), message(2))
@@ -64,7 +64,7 @@ def test_work_and_memory_are_bounded_by_the_size(count, within, beyond):
         getattr(budget, count)(beyond)
 
 
-def test_each_is_counted_by_itself():
+def test_each_budget_is_counted_separately():
     budget = ReadBudget(0)
     for count in (budget.read, budget.expand, budget.keep):
         count(64 * 2**20)

@@ -22,7 +22,7 @@ from hilctl.recording.time_range import TimeRange
 from tests.unit.recording.conftest import same_samples, written
 
 
-def test_everything_comes_back(recorded, make):
+def test_everything_is_read_back(recorded, make):
     path, batches = recorded
     back = read(path)
     same_samples(back.samples, make.samples(batches))
@@ -75,7 +75,7 @@ def test_samples_lost_at_the_very_end_are_counted(tmp_path, make):
     assert read(path).dropped == 150
 
 
-def test_cut_short_file_gives_what_it_holds(tmp_path, make):
+def test_truncated_file_is_read_to_its_end(tmp_path, make):
     path = tmp_path / "run.mcap"
     batches = [make.batch(200 * i, 4, seed=i) for i in range(10)]
     stream = io.BytesIO()
@@ -144,7 +144,7 @@ def test_pieces_of_a_stretch_are_cut_from_the_whole(monkeypatch, seven_blocks):
     assert_joined(pieces, cut)
 
 
-def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, seven_blocks):
+def test_abandoned_stream_closes_file_and_thread(monkeypatch, seven_blocks):
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 1)
     before = {*threading.enumerate()}
     opened, streams = Path.open, []
@@ -163,12 +163,12 @@ def test_a_walk_that_is_left_leaves_nothing_behind(monkeypatch, seven_blocks):
     assert all(stream.closed for stream in streams)
 
 
-def test_a_walk_can_be_repeated(seven_blocks):
+def test_stream_can_be_read_again(seven_blocks):
     pieces = RecordingStream(seven_blocks)
     assert [p.samples.index.size for p in pieces] == [p.samples.index.size for p in pieces]
 
 
-def test_what_samples_are_can_not_be_said_behind_them(tmp_path, monkeypatch, make):
+def test_metadata_after_the_samples_is_refused(tmp_path, monkeypatch, make):
     path = tmp_path / "run.mcap"
     with path.open("wb") as stream:
         writer = make.write(stream, [make.batch(0, 4)], finish=False)

@@ -37,7 +37,7 @@ def state(folder):
     return {path.name: (path.read_bytes(), path.stat().st_mtime_ns) for path in folder.iterdir()}
 
 
-def test_the_bytes_as_they_were_stay(torn):
+def test_original_bytes_are_kept(torn):
     bytes_before = torn.read_bytes()
     assert recover_recording(torn).original == torn.with_name("run.mcap.torn")
     torn.write_bytes(bytes_before[:-3000])
@@ -48,7 +48,7 @@ def test_the_bytes_as_they_were_stay(torn):
 
 
 @pytest.mark.parametrize("extra", [0, 3])
-def test_a_sound_file_is_left_alone(torn, batches, extra):
+def test_intact_file_is_not_changed(torn, batches, extra):
     recover_recording(torn)
     before = state(torn.parent)
     recovered = recover_recording(torn, batches[:extra])
@@ -57,7 +57,7 @@ def test_a_sound_file_is_left_alone(torn, batches, extra):
     assert state(torn.parent) == before
 
 
-def test_output_leaves_the_file_where_it_is(torn):
+def test_output_option_keeps_the_original(torn):
     before = torn.read_bytes()
     output = torn.with_name("whole.mcap")
     recovered = recover_recording(torn, output=output)
@@ -123,7 +123,7 @@ def test_reading_warns_and_writes_nothing(torn, caplog):
     assert not caplog.messages
 
 
-def test_torn_and_recovered_read_alike(torn):
+def test_torn_and_recovered_files_read_the_same(torn):
     before = read(torn)
     recover_recording(torn)
     after = read(torn)
@@ -165,7 +165,7 @@ def test_absent_and_other_files_are_refused(tmp_path):
     assert state(tmp_path).keys() == {"x.mcap"}
 
 
-def test_ring_batches_fill_the_end(torn, batches, make):
+def test_batches_of_the_ring_complete_the_file(torn, batches, make):
     killed = {"code": "fault", "reason": "killed"}
     tuned = Event(3100, "info", "tuned", "gain to 2", {"samples": 20.0})
     recovered = recover_recording(torn, batches[2:], killed, events=[tuned])
@@ -188,7 +188,7 @@ def test_ring_batches_fill_the_end(torn, batches, make):
     assert all(each == list(range(len(each))) for each in numbers.values())
 
 
-def test_parts_of_ring_batches_and_gaps(torn, batches, make):
+def test_overlapping_batches_and_gaps(torn, batches, make):
     straddling = make.batch(2500, 20, seed=9)
     late = batches[4].rows(slice(4, 20))
     recovered = recover_recording(torn, [straddling, late], ended_at=6000)
@@ -201,14 +201,14 @@ def test_parts_of_ring_batches_and_gaps(torn, batches, make):
     assert back.end["recorded_samples"] == "4300"
 
 
-def test_ring_batches_alone(batches, tmp_path):
+def test_recovery_from_batches_only(batches, tmp_path):
     path = written(tmp_path / "run.mcap", [], finish=False)
     recovered = recover_recording(path, batches)
     assert recovered.added_samples == read(path).samples.index.size == 5000
 
 
 @pytest.mark.slow
-def test_the_command(torn):
+def test_recover_command(torn):
     reported = hilctl("export", torn, torn.with_name("run.csv"))
     assert reported.stderr.startswith(f"hilctl: {torn}: ")
     assert "'hilctl recover'" in reported.stderr.splitlines()[0]
@@ -220,7 +220,7 @@ def test_the_command(torn):
     assert "nothing to recover" in second.stdout
 
 
-def test_a_recording_is_written_by_one(tmp_path):
+def test_recording_has_one_writer(tmp_path):
     path = tmp_path / "run.mcap"
     with path.open("xb") as writer, path.open("rb") as reader:
         lock(writer)

@@ -132,7 +132,7 @@ def test_cut_at_every_kind_of_boundary(sound, tmp_path):
     assert {sound.before(cut) for cut in boundaries(sound)} <= counts
 
 
-def test_no_flipped_bit_leaves_a_file_sound(sound):
+def test_flipped_bits_are_detected(sound):
     rng = np.random.default_rng(3)
     places = set(rng.integers(0, len(sound.data), 60).tolist())
     for opcode, start, end in sound.records:
@@ -150,7 +150,7 @@ def test_no_flipped_bit_leaves_a_file_sound(sound):
 
 
 @pytest.mark.parametrize("name", ["hilctl.run", "hilctl.end"])
-def test_a_flipped_bit_in_the_facts_is_told_by_all_who_read_them(sound, tmp_path, caplog, name):
+def test_flipped_bit_in_the_facts_is_reported_by_all_readers(sound, tmp_path, caplog, name):
     facts = [start for opcode, start, _ in sound.records if opcode == METADATA]
     text, start = (b"200.0", facts[0]) if name == "hilctl.run" else (b"completed", facts[1])
     at = sound.data.index(text, start)
@@ -171,7 +171,7 @@ def test_a_flipped_bit_in_the_facts_is_told_by_all_who_read_them(sound, tmp_path
     assert len(list(tmp_path.iterdir())) == 2
 
 
-def test_a_bit_that_no_other_checksum_covers_is_noticed(sound, tmp_path, caplog):
+def test_flipped_bit_outside_the_chunks_is_detected(sound, tmp_path, caplog):
     start = [start for opcode, start, _ in sound.records if opcode == CHUNK][-1]
     damaged = bytearray(sound.data)
     damaged[start + 9] ^= 1
@@ -183,7 +183,7 @@ def test_a_bit_that_no_other_checksum_covers_is_noticed(sound, tmp_path, caplog)
     assert recover_recording(path).sound
 
 
-def test_a_file_without_checksums_is_sound(sound, tmp_path):
+def test_file_without_checksums_is_intact(sound, tmp_path):
     """0 means that there is none: so older recordings have it."""
     (end,) = [start for opcode, start, _ in sound.records if opcode == DATA_END]
     path = tmp_path / "run.mcap"
@@ -208,7 +208,7 @@ def test_random_cuts_garbage_and_zeros(sound, tmp_path):
         check(path, sound, cut)
 
 
-def test_messages_of_a_torn_chunk_are_saved(sound, tmp_path):
+def test_messages_of_a_truncated_chunk_are_recovered(sound, tmp_path):
     last = [(start, end) for code, start, end in sound.records if code == CHUNK][3]
     cut = last[1] - 1000
     path = tmp_path / "run.mcap"
@@ -292,7 +292,7 @@ def test_a_file_cut_in_its_index_keeps_its_end(sound, tmp_path):
     assert "unknown" not in recovered.reason
 
 
-def test_a_damaged_index_is_made_anew(sound, tmp_path):
+def test_damaged_index_is_rebuilt(sound, tmp_path):
     path = tmp_path / "run.mcap"
     ended = next(end for code, _, end in sound.records if code == DATA_END)
     for _, start, end in sound.records:
@@ -316,7 +316,7 @@ def test_an_index_without_a_checksum_must_fit(sound, tmp_path, opcode, at):
     assert check(path, sound, len(data)) == len(sound.messages)
 
 
-def test_missing_message_indexes_are_made(make, tmp_path, monkeypatch):
+def test_missing_message_indexes_are_rebuilt(make, tmp_path, monkeypatch):
     import hilctl.recording.writer as module
 
     kinds = IndexType.ALL & ~IndexType.MESSAGE
@@ -327,7 +327,7 @@ def test_missing_message_indexes_are_made(make, tmp_path, monkeypatch):
 
 
 @pytest.mark.parametrize("behind", [b"\0", bytes(5000), b"\x06garbage"])
-def test_what_stands_behind_the_end_is_cut_off(sound, tmp_path, behind):
+def test_bytes_after_the_end_are_removed(sound, tmp_path, behind):
     path = tmp_path / "run.mcap"
     path.write_bytes(sound.data + behind)
     assert check(path, sound, len(sound.data)) == len(sound.messages)
@@ -342,7 +342,7 @@ def refusal(what, path):
 
 
 @given(st.data())
-def test_any_cut_and_any_flip_raise_nothing_else(sound, tmp_path_factory, data):
+def test_any_damage_raises_only_known_errors(sound, tmp_path_factory, data):
     torn = bytearray(sound.data[: data.draw(st.integers(0, len(sound.data)))])
     for _ in range(data.draw(st.integers(0, 3)) if torn else 0):
         torn[data.draw(st.integers(0, len(torn) - 1))] = data.draw(st.integers(0, 255))
@@ -395,7 +395,7 @@ def resaved(survey, **finish):
     return saved, reason, facts["hilctl.end"]
 
 
-def test_a_survey_counts_what_is_whole(torn):
+def test_survey_counts_intact_records(torn):
     survey = Survey(torn)
     assert (survey.samples, survey.next_sample) == (400, 400)
     assert survey.run["compensator"] == "rdpi"
@@ -411,7 +411,7 @@ FAULT = {"code": "fault", "reason": "x"}
     ({"end": FAULT, "ended_at": 450}, 50, "fault", "50 samples known"),
     ({"ended_at": 400}, 0, "recovered", "no sample is lost"),
 ])  # fmt: skip
-def test_what_is_missing_or_not_known_is_said(torn, finish, missing, code, words):
+def test_missing_and_unknown_samples_are_reported(torn, finish, missing, code, words):
     saved, reason, end = resaved(Survey(torn), **finish)
     assert words in reason
     assert saved.missing == int(end["missing_samples"]) == missing

@@ -37,7 +37,7 @@ def test_a_sound_file_has_no_damage(data):
     assert [r.name for r in records if isinstance(r, Metadata)] == ["hilctl.run", "hilctl.end"]
 
 
-def test_what_is_no_mcap_file_holds_nothing():
+def test_other_files_have_no_records():
     scan, records = salvaged(b"time,current\n" * 100)
     assert not scan.is_mcap
     assert records == []
@@ -62,7 +62,7 @@ def torn(data):
     return raw(chunk(data + b"\1" * 200))[:-200]
 
 
-def test_nonsense_behind_a_message_costs_that_message():
+def test_message_before_invalid_bytes_is_discarded():
     two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
 
     def saved(behind):
@@ -82,7 +82,7 @@ def test_a_whole_chunk_with_a_wrong_checksum_gives_nothing():
     assert take_chunk(wrong, ReadBudget(2**20), last=True) == ([], "damaged chunk")
 
 
-def test_zeros_at_the_end_cost_the_message_that_they_end():
+def test_message_that_ends_in_zeros_is_discarded():
     """What ends in zeros may have been something else before the power failed."""
     two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
     records, _ = take_chunk(torn(two)[:-1] + b"\0", ReadBudget(2**20), last=True)

@@ -18,7 +18,7 @@ ONE = GOLDEN[0]
 
 
 @pytest.mark.parametrize("path", GOLDEN, ids=lambda path: path.stem)
-def test_both_ends_say_what_the_whole_file_says(path):
+def test_ends_have_the_facts_of_the_whole_file(path):
     ends, whole = read_ends(path), read(path)
     assert (ends.run, ends.end, ends.state) == (whole.run, whole.end, "finished")
 
@@ -72,7 +72,7 @@ def test_a_file_that_was_cut_is_not_finished(tmp_path, left):
     assert (ends.run, ends.end, ends.state) == (read(ONE).run, {}, "unfinished")
 
 
-def test_a_file_that_a_run_writes_to_says_so(tmp_path):
+def test_file_in_use_by_a_run_is_reported(tmp_path):
     path = tmp_path / "live.mcap"
     path.write_bytes(ONE.read_bytes()[:-20])
     with path.open("r+b") as writer:
@@ -81,7 +81,7 @@ def test_a_file_that_a_run_writes_to_says_so(tmp_path):
     assert read_ends(path).state == "unfinished"
 
 
-def test_no_damage_of_the_last_bytes_is_taken_for_an_end(tmp_path):
+def test_damaged_last_bytes_are_no_end(tmp_path):
     whole, run = bytearray(ONE.read_bytes()), read(ONE)
     path = tmp_path / "damaged.mcap"
     for back in range(1, 700):
@@ -93,7 +93,7 @@ def test_no_damage_of_the_last_bytes_is_taken_for_an_end(tmp_path):
         assert ends.end in ({}, run.end)
 
 
-def test_no_flipped_bit_leaves_wrong_facts(tmp_path, make):
+def test_flipped_bits_give_no_wrong_facts(tmp_path, make):
     path = written(tmp_path / "run.mcap", [make.batch(0, 4)])
     whole, right = path.read_bytes(), read_ends(path)
     head = whole.index(b"model.yaml")
@@ -118,7 +118,7 @@ def test_no_flipped_bit_leaves_wrong_facts(tmp_path, make):
     (ONE.read_bytes()[:30], "holds no run of hilctl"),
     (ONE.read_bytes()[:200], "holds no run of hilctl"),
 ])  # fmt: skip
-def test_what_is_no_recording_is_refused(tmp_path, content, problem):
+def test_other_files_are_refused_by_read_ends(tmp_path, content, problem):
     path = tmp_path / "other.mcap"
     path.write_bytes(content)
     with pytest.raises(DataError, match=f"other.mcap: {problem}"):
@@ -126,7 +126,7 @@ def test_what_is_no_recording_is_refused(tmp_path, content, problem):
 
 
 @pytest.mark.timeout(20)
-def test_nobody_waits_for_a_pipe(tmp_path):
+def test_reading_a_pipe_does_not_block(tmp_path):
     os.mkfifo(tmp_path / "pipe.mcap")
     with pytest.raises(DataError, match="regular"):
         read_ends(tmp_path / "pipe.mcap")

@@ -29,7 +29,7 @@ GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_compens
     (-5.0, 1 / 50_000, 0, 0),
     (-1e308, 1e308, 0, 6149),
 ])  # fmt: skip
-def test_it_is_cut_by_the_time_of_the_samples(from_s, to_s, first, last):
+def test_range_is_cut_at_the_times_of_the_samples(from_s, to_s, first, last):
     part = read(GOLDEN, TimeRange(from_s, to_s))
     assert (part.samples.index[0], part.samples.index[-1]) == (first, last)
     assert {values.size for values in part.samples.columns().values()} <= {0, last + 1 - first}
@@ -48,7 +48,7 @@ def test_no_sample_between_the_times_is_an_error(from_s, to_s):
         read(GOLDEN, TimeRange(from_s, to_s))
 
 
-def test_blocks_elsewhere_are_not_kept(monkeypatch):
+def test_blocks_outside_the_range_are_not_kept(monkeypatch):
     kept = []
 
     class Counting(ReadBudget):
@@ -118,7 +118,7 @@ STRETCHES = [
 
 
 @pytest.mark.parametrize("stretch", STRETCHES, ids=str)
-def test_the_index_gives_what_a_walk_gives(monkeypatch, recorded, stretch):
+def test_index_and_scan_give_the_same(monkeypatch, recorded, stretch):
     found = read(recorded, stretch)
     monkeypatch.setattr(reader, "places_of", lambda stream, stretch: None)
     whole = read(recorded, stretch)
@@ -129,7 +129,7 @@ def test_the_index_gives_what_a_walk_gives(monkeypatch, recorded, stretch):
     assert all(getattr(found, name) == getattr(whole, name) for name in names)
 
 
-def test_the_rest_is_not_read(recorded):
+def test_bytes_outside_the_range_are_not_read(recorded):
     with recorded.open("rb") as stream:
         everything = places_of(stream, TimeRange(None, None))
         few = places_of(stream, TimeRange(0.05, 0.0501))
@@ -138,7 +138,7 @@ def test_the_rest_is_not_read(recorded):
     assert set(few) < set(everything)
 
 
-def test_damage_elsewhere_is_not_seen_and_damage_within_is_told(recorded, caplog):
+def test_damage_is_reported_within_the_range_only(recorded, caplog):
     data = bytearray(recorded.read_bytes())
     with recorded.open("rb") as stream:
         at = places_of(stream, TimeRange(None, None))
@@ -155,7 +155,7 @@ def test_damage_elsewhere_is_not_seen_and_damage_within_is_told(recorded, caplog
 
 
 @pytest.mark.parametrize("change", ["cut", "crc", "footer", "magic", "far"])
-def test_without_a_sound_index_the_file_is_walked_through(recorded, change):
+def test_file_without_an_intact_index_is_scanned(recorded, change):
     data = bytearray(recorded.read_bytes())
     if change == "cut":
         del data[-50:]
@@ -174,6 +174,6 @@ def test_without_a_sound_index_the_file_is_walked_through(recorded, change):
     assert np.array_equal(read(recorded, TimeRange(0.05, 0.06)).samples.index, expected)
 
 
-def test_a_stretch_without_samples_is_refused(recorded):
+def test_range_without_samples_is_refused(recorded):
     with pytest.raises(DataError, match="from 5 s"):
         read(recorded, TimeRange(5.0, None))

@@ -113,7 +113,7 @@ def _set(topic, **fields):
         ),
     ],
 )  # fmt: skip
-def test_messages_that_hilctl_can_not_have_written(crafted, tmp_path, change, problem):
+def test_messages_that_hilctl_never_writes_are_refused(crafted, tmp_path, change, problem):
     path = crafted(change)
     with pytest.raises(DataError, match=problem) as caught:
         read(path)
@@ -132,14 +132,14 @@ def test_messages_that_hilctl_can_not_have_written(crafted, tmp_path, change, pr
     ({"command_unit": "V"}, "0 values of wanted_v for 400 samples"),
     ({"segments": "[" * 50_000}, "segments|nested"),
 ])  # fmt: skip
-def test_facts_that_are_none(crafted, facts, problem):
+def test_invalid_facts_are_refused(crafted, facts, problem):
     path = crafted(lambda where, data: data.update(facts) if where == "hilctl.run" else None)
     with pytest.raises(DataError, match=problem):
         read(path)
 
 
 @pytest.mark.parametrize("count", ["-1", "9" * 5000, "1e3", "٣"])
-def test_counts_that_are_none(crafted, count):
+def test_invalid_counts_are_refused(crafted, count):
     change = {"missing_samples": count}
     path = crafted(lambda where, data: data.update(change) if where == "hilctl.end" else None)
     with pytest.raises(DataError, match="missing_samples"):
@@ -160,7 +160,7 @@ def test_a_topic_with_another_schema_is_refused(crafted, tmp_path):
     assert read(recovered.path).events
 
 
-def test_numbers_of_facts():
+def test_numbers_in_facts_are_read():
     assert validation.number_of({"rate": "2.5"}, "rate", 0.0, 9.0) == 2.5
     assert validation.count_of({}, "missing_samples") == 0
     with pytest.raises(ValueError, match="rate is missing"):
@@ -168,7 +168,7 @@ def test_numbers_of_facts():
 
 
 @pytest.mark.parametrize("seconds", [-1, 9_223_372_036, 2**40])
-def test_clocks_that_no_recording_can_hold(seconds):
+def test_impossible_start_times_are_refused(seconds):
     with pytest.raises(InputError, match="1970 and 2261"):
         RecordingLayout(1000.0, "A", False, 100.0, seconds * 10**9)
 
@@ -182,7 +182,7 @@ def _with_chunk(sound, say, real, times):
 
 
 @pytest.mark.parametrize(("say", "real"), [(2**40, 2**20), (2**20, 2**28), (2**25, 2**25)])
-def test_bombs_take_no_memory(tmp_path, make, say, real):
+def test_compression_bombs_are_refused(tmp_path, make, say, real):
     stream = io.BytesIO()
     make.write(stream, [make.batch(0, 40)])
     path = tmp_path / "bomb.mcap"
@@ -194,7 +194,7 @@ def test_bombs_take_no_memory(tmp_path, make, say, real):
             refuse(path)
 
 
-def test_what_a_dying_process_left_is_looked_at(tmp_path, make):
+def test_blocks_of_a_dead_process_are_validated(tmp_path, make):
     path = written(tmp_path / "run.mcap", [make.batch(0, 4)], finish=False)
     left = make.batch(200, 4)
     left.heads[0, BlockHeader.FIRST_SAMPLE] = -5
@@ -212,7 +212,7 @@ def test_what_a_dying_process_left_is_looked_at(tmp_path, make):
 @pytest.mark.parametrize(
     "text", ["", "[]", "3", '{"a": true}', '{"a": null}', '{"a": {}}', '{"a": NaN}', "[" * 100_000]
 )
-def test_labels_that_are_none_are_refused(text):
+def test_invalid_labels_are_refused(text):
     with pytest.raises(ValueError, match="labels must"):
         validation.labels_of({"labels": text})
     assert validation.labels_of({}) == {}  # as in older recordings
@@ -229,13 +229,13 @@ GOOD = Segment("sine", 0, 100, 10, 90, 20.0).to_mapping()
         {"start": False},
     ],
 )  # fmt: skip
-def test_segments_that_can_not_be(change):
+def test_impossible_segments_are_refused(change):
     assert validation.segments_of(json.dumps([GOOD])) == (Segment(**GOOD),)
     with pytest.raises(ValueError, match="segments: "):
         validation.segments_of(json.dumps([{**GOOD, **change}]))
 
 
-def test_what_hilctl_does_not_write_but_could_mean():
+def test_tolerated_deviations_from_the_format():
     """A period may be left out, or be whole, and a label may hold a tab."""
     odd = {**GOOD, "period": 20, "label": "sine\t"}
     assert validation.segments_of(json.dumps([odd])) == (Segment("sine\t", 0, 100, 10, 90, 20.0),)
@@ -246,6 +246,6 @@ def test_what_hilctl_does_not_write_but_could_mean():
 @pytest.mark.parametrize(
     "text", ["3", "{}", "[3]", "[[]]", "[" * 100_000 + "]" * 100_000, json.dumps([GOOD, GOOD])]
 )
-def test_texts_that_list_no_segments(text):
+def test_texts_without_segments(text):
     with pytest.raises(ValueError, match="segments: "):
         validation.segments_of(text)

@@ -14,7 +14,7 @@ from tests.fakes import FailingFile
 from tests.unit.recording.conftest import written
 
 
-def test_event_has_its_numbers_and_its_time(tmp_path, make):
+def test_event_has_its_values_and_time(tmp_path, make):
     values = {"gain": 1.5, "offset": -0.1, "samples": 250.0}
     path = written(tmp_path / "run.mcap", [], events=[Event(100, "info", "tuned", "text", values)])
     due_ns = make.start_ns + 100 * 20_000
@@ -41,7 +41,7 @@ def test_replay_can_start_first_and_after_each_gap(recorded):
 @pytest.mark.parametrize(
     ("overwrite", "said"), [(True, "Not a regular file"), (False, "File exists")]
 )
-def test_a_pipe_is_no_place_for_a_recording(tmp_path, overwrite, said):
+def test_recording_to_a_pipe_is_refused(tmp_path, overwrite, said):
     """Opened, it would wait for a reader for ever, or lose what is written."""
     os.mkfifo(tmp_path / "run.mcap")
     with pytest.raises(OSError, match=said):
@@ -93,7 +93,7 @@ def test_half_a_write_is_written_again_from_its_first_byte_or_removed(pending, a
 
 
 @pytest.mark.parametrize("size", [0, 3])
-def test_nothing_is_written_behind_the_end_of_a_truncated_file(pending, size):
+def test_truncated_file_is_not_extended(pending, size):
     """It would leave a hole of zeros."""
     file, _, path = pending
     file.write(b"first")
@@ -107,7 +107,7 @@ def test_nothing_is_written_behind_the_end_of_a_truncated_file(pending, size):
     assert path.read_bytes() == b"first"[:size]
 
 
-def test_a_file_that_has_its_name_again_gets_what_it_lacks(pending):
+def test_renamed_file_is_completed_when_its_name_is_back(pending):
     file, _, path = pending
     file.write(b"first")
     path.rename(moved := path.with_name("moved"))
@@ -153,7 +153,7 @@ def test_bytes_that_a_failed_sync_lost_are_written_again(pending, monkeypatch):
     assert lossy.kept == 11
 
 
-def test_bytes_that_are_no_longer_in_memory_are_lost_for_good(pending, monkeypatch):
+def test_bytes_that_are_not_in_memory_cannot_be_rewritten(pending, monkeypatch):
     """The kernel reports it once: a later sync that succeeds must not hide it."""
     file, _, path = pending
     monkeypatch.setattr(os, "fsync", lossy := LossyDisk(path))
@@ -167,7 +167,7 @@ def test_bytes_that_are_no_longer_in_memory_are_lost_for_good(pending, monkeypat
     assert "the disk" in file.problem
 
 
-def test_a_file_that_nobody_flushes_does_not_grow_in_memory(pending):
+def test_pending_bytes_are_bounded(pending):
     file, disk, path = pending
     disk.write_errors = [errno.EIO]
     file.write(bytes(2 << 20))
@@ -178,7 +178,7 @@ def test_a_file_that_nobody_flushes_does_not_grow_in_memory(pending):
     assert path.stat().st_size == file.tell() == (2 << 20) + 4
 
 
-def test_a_claimed_file_is_given_back_on_a_full_disk_too(tmp_path):
+def test_claimed_file_is_restored_on_a_full_disk(tmp_path):
     claimed = OutputFile(tmp_path / "run.mcap", overwrite=False)
     claimed.stream.close()
     claimed.stream = Mock(close=Mock(side_effect=OSError(28, "No space left on device")))
@@ -186,14 +186,14 @@ def test_a_claimed_file_is_given_back_on_a_full_disk_too(tmp_path):
     assert not list(tmp_path.iterdir())
 
 
-def test_a_claimed_file_that_is_gone_can_be_given_back(tmp_path):
+def test_claimed_file_that_was_deleted_is_no_error(tmp_path):
     claimed = OutputFile(tmp_path / "run.mcap", overwrite=False)
     (tmp_path / "run.mcap").unlink()
     claimed.give_back()
     assert claimed.stream._raw.closed
 
 
-def test_a_file_that_stood_there_stays(tmp_path):
+def test_existing_file_is_kept(tmp_path):
     path = tmp_path / "run.mcap"
     for before in (b"", b"\x89MCAP0\r\n before"):
         path.write_bytes(before)

@@ -37,7 +37,7 @@ def test_a_run_without_a_pace_misses_nothing():
     assert planned(loaded_of(), paced=False).late_rules.max_missed == np.inf
 
 
-def test_the_compensator_starts_from_the_memory_that_was_given():
+def test_compensator_starts_from_the_given_state():
     loaded = loaded_of(name="terfenol_sine_6a.yaml")
     rest = planned(loaded).axes[0].compensator
     state = rest.state()

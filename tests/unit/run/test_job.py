@@ -27,7 +27,7 @@ def folder(tmp_path):
         yield folder
 
 
-def test_the_job_is_what_was_checked_even_where_its_files_have_gone(folder, tmp_path):
+def test_job_contains_the_checked_files(folder, tmp_path):
     """Between the check and the start a model file may change: the run is the checked one."""
     shutil.copytree(CONFIGS, tmp_path / "configs")
     (tmp_path / "link").symlink_to("configs")
@@ -49,7 +49,7 @@ def test_the_job_is_what_was_checked_even_where_its_files_have_gone(folder, tmp_
 
 
 @pytest.mark.parametrize("path", sorted(CONFIGS.glob("*.yaml")), ids=lambda path: path.stem)
-def test_an_experiment_goes_through_its_text_unchanged(path):
+def test_experiment_is_restored_from_its_text(path):
     loaded = load_experiment(path)
     again = resolve(
         Document("experiment", loaded.yaml_text), loaded.folder, files=TextFiles(loaded.files.texts)
@@ -66,14 +66,14 @@ def test_infinite_numbers_and_states_are_read_back(folder):
     assert Job.read(folder.job) == job
 
 
-def test_an_input_that_is_the_reference_is_kept_once(folder):
+def test_input_equal_to_the_reference_is_stored_once(folder):
     plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
     job = Job.of(plain, folder, locks=[], take_over=False, supervisor=1, silence_s=1.0)
     assert (job.reference == job.input_um) == (plain.begun.input_um is plain.reference.values)
     assert (job.state is None) == (plain.begun.state is None)
 
 
-def test_samples_that_find_no_room_are_told(folder, monkeypatch):
+def test_missing_memory_for_the_samples_is_reported(folder, monkeypatch):
     plain = checked_experiment(CONFIGS / "terfenol_sine_6a_uncompensated.yaml", [])
     monkeypatch.setattr(np, "save", Mock(side_effect=OSError("8000 requested and 512 written")))
     with pytest.raises(RunError, match=r"recording\.ring_s"):

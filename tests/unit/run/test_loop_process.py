@@ -118,7 +118,7 @@ def test_a_loop_that_breaks_makes_the_output_safe_and_closes(broken):
     assert page.get(PageField.PHASE) == Phase.RUNNING
 
 
-def test_the_cause_is_not_lost_behind_a_device_that_can_not_be_reached(broken):
+def test_cause_is_reported_even_if_the_device_does_not_answer(broken):
     device, error, _ = broken(reachable=False)
     assert device.events[-1] == "close"
     assert str(error).startswith("the loop broke: ZeroDivisionError")
@@ -215,7 +215,9 @@ def test_a_loop_ends_if_its_output_needs_no_guardian(orphaned, monkeypatch, why)
     (RunError("then that"), 1, Phase.FAILED, "then that"),
     (KeyError("a bug"), 1, Phase.FAILED, "the loop broke: KeyError: 'a bug'"),
 ])  # fmt: skip
-def test_all_that_it_has_to_say_is_in_the_page(prepared, monkeypatch, raised, code, phase, text):
+def test_outcome_and_errors_are_in_the_shared_page(
+    prepared, monkeypatch, raised, code, phase, text
+):
     """The supervisor tells by the phase what is there: an outcome, a refusal, or a fault.
 
     A stop comes from the supervisor alone, so that the loop ends by the ramp.
@@ -251,7 +253,7 @@ OF_OTHERS = ("scipy.special", "mcap", "google.protobuf", "rich", "typer")
     ("hilctl.cli.run", BULKY),
     ("hilctl.run.control.client", (*BULKY, *OF_OTHERS, "numpy", "pydantic")),
 ], ids=["loop", "simulated loop", "supervisor", "client"])  # fmt: skip
-def test_it_has_nothing_that_only_others_need(modules, left_out):
+def test_processes_import_only_what_they_need(modules, left_out):
     program = f"import sys, {modules};"
     if "loop_process" in modules:  # numba imports some with its first kernel
         program += "from hilctl.kernels import jit, limit; jit.ensure_compiled(limit.limit_block);"
@@ -280,7 +282,7 @@ def host(ring, clock, monkeypatch):
     return RingHost([ring], clock, 77, SILENCE_S)
 
 
-def test_each_reason_to_end_is_said(host, ring, clock, monkeypatch):
+def test_each_reason_to_end_is_reported(host, ring, clock, monkeypatch):
     clock.now += int(SILENCE_S * 1e9)
     assert host.heartbeat(0, 0) == ""
     clock.now += 1
@@ -293,7 +295,7 @@ def test_each_reason_to_end_is_said(host, ring, clock, monkeypatch):
     assert host.heartbeat(0, 0) == Stop.CTRL_C.reason
 
 
-def test_a_tuning_is_taken_once(host, ring):
+def test_tuning_is_applied_once(host, ring):
     page = ring.page
     assert host.tuning() is None
     for number, gain in enumerate((0.5, 0.75), start=1):
@@ -386,7 +388,7 @@ def copied(batch):
 
 
 @pytest.mark.parametrize("block", [1, 7])
-def test_a_slot_that_is_used_again_has_nothing_of_its_last_block(tmp_path, monkeypatch, block):
+def test_reused_slot_contains_nothing_of_its_last_block(tmp_path, monkeypatch, block):
     def recorded(folder):
         rig = Rig(folder, block=block, stalls={9: 2_500_000})
         outcome = rig.run()

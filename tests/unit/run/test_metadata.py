@@ -94,7 +94,7 @@ def test_profiles_have_hashes():
         assert facts[f"device.{name}_sha256"] == hashlib.sha256(text.encode()).hexdigest()
 
 
-def test_a_description_says_what_the_experiment_says(tmp_path):
+def test_description_has_the_values_of_the_experiment(tmp_path):
     given = RunDescription.of(checked_experiment(CONFIGS / "demo.yaml", []))
     given.write(tmp_path / "description.json")
     seen = RunDescription.read(tmp_path / "description.json")
@@ -115,7 +115,7 @@ def test_settings_are_dotted_and_nested_sequences_are_changed_in_the_file():
     ]
 
 
-def test_a_description_of_another_version_is_none(tmp_path):
+def test_description_of_another_version_is_refused(tmp_path):
     (tmp_path / "description.json").write_text('{"name": "x"}')
     with pytest.raises(ValueError, match="sample_rate_hz"):
         RunDescription.read(tmp_path / "description.json")
@@ -149,7 +149,7 @@ def reported(recording):
 @pytest.mark.parametrize("name", ["terfenol_compensated", "terfenol_uncompensated"])
 @pytest.mark.parametrize("segments", [(), TWO, ONCE, FAST, LONG])
 @pytest.mark.parametrize("pieces", [1, 500])
-def test_they_are_those_of_the_report(name, segments, pieces):
+def test_end_metrics_are_those_of_the_report(name, segments, pieces):
     recording = read(GOLDEN / f"{name}.mcap")
     samples = recording.samples.rows(recording.samples.index % 1000 > 3)
     samples.displacement_um[40::997] = np.nan
@@ -161,7 +161,7 @@ def test_they_are_those_of_the_report(name, segments, pieces):
     assert bool(found) == (segments not in (FAST, LONG))
 
 
-def test_a_segment_that_was_cut_short_has_none():
+def test_truncated_segment_has_no_metrics():
     recording = replace(read(GOLDEN / "terfenol_compensated.mcap"), segments=TWO)
     cut = replace(recording, samples=recording.samples.part(0, TWO[1].steady_stop - 1))
     first = replace(recording, segments=TWO[:1])
@@ -172,14 +172,14 @@ def test_a_segment_that_was_cut_short_has_none():
 @pytest.mark.parametrize(
     ("at", "takes", "counts"), [(50, 50, True), (50, 51, False), (2999, 1, False), (5900, 9, True)]
 )
-def test_a_segment_that_was_tuned_has_none(at, takes, counts):
+def test_tuned_segment_has_no_metrics(at, takes, counts):
     segments = (Segment("a", 0, 6000, 100, 5000, 500.0),)
     recording = replace(read(GOLDEN / "terfenol_compensated.mcap"), segments=segments)
     change = Event(at, "info", TUNED, "", {"gain": 0.5, "offset": 0.0, "samples": float(takes)})
     assert bool(gathered(recording, events=[change])) == counts
 
 
-def test_samples_of_the_ramp_are_of_no_segment():
+def test_samples_of_the_ramp_belong_to_no_segment():
     """A run that is stopped goes on to the safe value, past where its segment would have ended."""
     recording = read(GOLDEN / "terfenol_compensated.mcap")
     samples = recording.samples
@@ -188,7 +188,7 @@ def test_samples_of_the_ramp_are_of_no_segment():
 
 
 @pytest.mark.filterwarnings("error")
-def test_readings_near_the_end_of_all_numbers_are_read_in_silence():
+def test_largest_numbers_cause_no_warning():
     recording = read(GOLDEN / "terfenol_compensated.mcap")
     recording.samples.displacement_um[::2] = 1.7e308
     recording.samples.displacement_um[1::2] = -1.7e308

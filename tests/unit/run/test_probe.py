@@ -38,7 +38,7 @@ INFO = DeviceInfo(
     (1e-14, -1e-15, []),
     (-200.0, 12.0, ["displacement", "output .* got 12 A .compare scale"]),
 ])  # fmt: skip
-def test_what_can_not_be_is_said_with_its_likely_cause(displacement_um, output, faults):
+def test_implausible_readings_are_reported_with_a_likely_cause(displacement_um, output, faults):
     found = judge(INFO, displacement_um, output)
     assert len(found) == len(faults)
     for fault, text in zip(found, faults, strict=True):
@@ -106,7 +106,7 @@ def rig(tmp_path):
 
 
 @pytest.mark.parametrize("profile", ["wago_750", "cobs_board"])
-def test_a_trip_stays_and_no_stale_command_takes_effect(rig, profile):
+def test_probe_keeps_a_tripped_watchdog_tripped(rig, profile):
     probed = rig(profile, watchdog={"timeout_s": 0.5})
     probed.drive(3.0)
     probed.clock.pass_s(1.0)

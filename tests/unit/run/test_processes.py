@@ -52,7 +52,7 @@ def never():
 @pytest.mark.parametrize(
     ("phase", "error"), [(Phase.REFUSED, InputError), (Phase.FAILED, RunError)]
 )
-def test_a_loop_that_can_not_start_says_why(started, phase, error):
+def test_loop_that_cannot_start_reports_the_reason(started, phase, error):
     child, page = started
     page.write_text(PageSlot.ERROR, "no port")
     page.put(PageField.PHASE, phase)
@@ -60,7 +60,7 @@ def test_a_loop_that_can_not_start_says_why(started, phase, error):
         child.await_ready(never)
 
 
-def test_a_loop_that_died_before_the_start_is_told_by_its_signal(started):
+def test_loop_that_died_before_the_start_is_reported_with_its_signal(started):
     child, _ = started
     child._process.code = -signal.SIGKILL
     with pytest.raises(RunError, match="SIGKILL"):
@@ -77,7 +77,7 @@ def test_the_device_is_acquired_when_the_loop_needs_it(started):
     assert page.get(PageField.HAS_DEVICE) == 1
 
 
-def test_a_loop_that_died_or_broke_says_what_it_can(started):
+def test_death_of_the_loop_is_reported_with_its_cause(started):
     child, page = started
     child._process.code = 7
     assert child.death() == "the loop process died: exit code 7"
@@ -88,7 +88,7 @@ def test_a_loop_that_died_or_broke_says_what_it_can(started):
     assert child.death() == "the loop broke: ZeroDivisionError"
 
 
-def test_a_loop_that_the_kernel_keeps_is_not_waited_for(started):
+def test_blocked_loop_process_is_not_awaited(started):
     child, _ = started
 
     def wait(timeout):
@@ -144,7 +144,7 @@ def test_a_device_is_claimed_until_its_guardian_has_released_it(left, sleeping):
     assert page.get(PageField.RELIEVED) == 0
 
 
-def test_a_guardian_that_keeps_its_device_is_not_waited_for_without_end(left, sleeping):
+def test_waiting_for_a_guardian_has_a_limit(left, sleeping):
     left()
     with held_devices([HOLDS]), DeviceLocks([HOLDS]) as locks:
         relief = GuardianRelief([HOLDS])
@@ -154,7 +154,7 @@ def test_a_guardian_that_keeps_its_device_is_not_waited_for_without_end(left, sl
             relief.acquire(locks, Mock(side_effect=RunError("stopped")))
 
 
-def test_relieved_runs_stay_for_samples_that_are_not_recorded(left):
+def test_relieved_runs_with_unrecorded_samples_are_kept(left):
     (_, page), (missing, other) = left(), left(recorded=False)
     relief = GuardianRelief([HOLDS])
     relief.note_write(0.5)

@@ -89,7 +89,7 @@ def test_a_refused_write_loses_neither_samples_nor_events(begun, number):
     assert recording.dropped == 0
 
 
-def test_a_disk_that_has_room_again_at_the_very_end_gets_all(begun, monkeypatch):
+def test_recording_is_complete_if_the_disk_has_room_at_the_end(begun, monkeypatch):
     made, disk = begun
     made.batch(batch(0, 20))
     made.flush()
@@ -119,7 +119,7 @@ def test_a_recording_counts_as_complete_once_it_is_on_the_disk(begun, monkeypatc
     assert synced == [(made.path, True), (made.path.parent, True)]
 
 
-def test_a_disk_that_can_not_keep_the_recording_is_an_error(begun, monkeypatch):
+def test_failed_sync_at_the_end_is_an_error(begun, monkeypatch):
     made, _ = begun
 
     monkeypatch.setattr(os, "fsync", Mock(side_effect=OSError(errno.EIO, os.strerror(errno.EIO))))
@@ -205,7 +205,7 @@ def numbered(first, blocks, block):
 
 
 @pytest.mark.parametrize("block", [1, 7, 4000])
-def test_last_samples_come_up_to_the_one_asked_for(block):
+def test_recent_samples_end_at_the_requested_one(block):
     tail = RecentSamples(50)
     for start in range(0, 40 * block, 4 * block):
         tail.add(numbered(start, 4, block))
@@ -218,7 +218,7 @@ def test_last_samples_come_up_to_the_one_asked_for(block):
         assert found.flags.tolist() == found.index.tolist()
 
 
-def test_nothing_comes_before_the_first_sample():
+def test_no_recent_samples_before_the_first_one():
     tail = RecentSamples(50)
     assert tail.up_to(10) is None
     tail.add(numbered(100, 1, 5))
@@ -234,7 +234,7 @@ def on_a_disk(checked, tmp_path):
     return Recorder(checked, folder / "run.mcap", overwrite=False)
 
 
-def test_a_folder_that_comes_back_gets_the_recording(on_a_disk):
+def test_recording_is_complete_if_its_folder_returns(on_a_disk):
     folder = on_a_disk.path.parent
     on_a_disk.begin(10**18, {})
     on_a_disk.batch(batch(0, 20))
@@ -353,7 +353,7 @@ def test_a_loop_lost_in_its_first_exchange_leaves_its_later_start(ring, recordin
     assert recording.recorder.firsts == [0]
 
 
-def test_room_is_given_back_once_the_file_has_what_stood_there(ring, recording):
+def test_slots_are_released_after_their_blocks_are_on_disk(ring, recording):
     exchange(ring, 3)
     recording._work()
     assert recording.recorder.firsts == [0, 1, 2]
@@ -361,7 +361,7 @@ def test_room_is_given_back_once_the_file_has_what_stood_there(ring, recording):
     assert recording.newest.heads[-1, BlockHeader.FIRST_SAMPLE] == 2
 
 
-def test_a_loop_that_is_never_waited_for_keeps_no_sample_from_the_file(ring, recording):
+def test_fast_loop_does_not_delay_flushes(ring, recording):
     exchange(ring, 1)
     flushed = []
     batch, flush = recording.recorder.batch, recording.recorder.flush
@@ -384,7 +384,7 @@ def test_a_loop_that_is_never_waited_for_keeps_no_sample_from_the_file(ring, rec
     assert ring.pop() is None
 
 
-def test_what_the_disk_refuses_stays_in_the_ring(ring, recording, monkeypatch):
+def test_refused_blocks_stay_in_the_ring(ring, recording, monkeypatch):
     now_s = 100.0
     monkeypatch.setattr(recorder.time, "monotonic", lambda: now_s)
     recording._released_s = now_s
@@ -422,7 +422,7 @@ def test_an_event_of_the_loop_never_comes_before_its_samples(ring, recording, mo
     assert (recorder.firsts[:1], recorder.events) == ([0], ["stroke"])
 
 
-def test_what_a_dead_loop_had_sent_is_recorded_as_not_answered(ring, recording):
+def test_sent_blocks_of_a_dead_loop_are_recorded_as_unanswered(ring, recording):
     exchange(ring, 4)
     exchange(ring, 2, answered=False)
     ring._area.heads[1, BlockHeader.SEQUENCE] = 77
@@ -432,7 +432,7 @@ def test_what_a_dead_loop_had_sent_is_recorded_as_not_answered(ring, recording):
     assert recording.recorder.finished == ("it died", 6)
 
 
-def test_whatever_goes_wrong_in_it_is_said_and_the_end_comes_all_the_same(ring, recording):
+def test_error_of_the_recorder_thread_is_reported_and_the_recording_ended(ring, recording):
     exchange(ring, 2)
     recording.recorder.broken = True
     recording._guarded(recording._work)
@@ -445,7 +445,7 @@ def test_whatever_goes_wrong_in_it_is_said_and_the_end_comes_all_the_same(ring, 
     assert recording.recorder.finished == ("waveform completed", 8)
 
 
-def test_marks_are_taken_as_long_as_they_will_be_in_the_file(ring, recording):
+def test_marks_are_accepted_while_they_can_be_recorded(ring, recording):
     exchange(ring, 1)
     recording.recorder.error = ""
     assert recording.takes_marks

@@ -45,7 +45,7 @@ def dead(tmp_path):
     return leave
 
 
-def test_a_run_that_left_no_ring_is_not_known_to_be_safe(dead):
+def test_run_without_a_ring_is_not_safe(dead):
     recording = dead()
     (orphan,) = recover_dead_runs()
     assert orphan.recording == recording
@@ -56,7 +56,7 @@ def test_a_run_that_left_no_ring_is_not_known_to_be_safe(dead):
     assert recover_dead_runs() == []
 
 
-def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
+def test_outcome_of_a_loop_that_ramped_down_counts(dead):
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
         ended = LoopOutcome("stopped", "stopped because the supervisor died", 0, "confirmed", 0)
@@ -73,7 +73,7 @@ def test_a_loop_that_ended_by_its_ramp_is_believed(dead):
 @pytest.mark.parametrize(
     ("error", "words"), [("", "confirmed by the device"), ("no answer", "no answer")]
 )
-def test_what_the_guardian_did_is_said(dead, error, words):
+def test_recovery_reports_the_action_of_the_guardian(dead, error, words):
     """Both others were dead; what it could not confirm is not called safe."""
 
     def fill(folder):
@@ -130,7 +130,7 @@ def test_a_recording_is_completed_while_the_guardian_acts(dead):
     os.close(guardian.pop())
 
 
-def test_a_recording_is_left_to_a_loop_that_still_ramps(dead, monkeypatch):
+def test_recording_of_a_loop_that_still_ramps_is_not_touched(dead, monkeypatch):
     loops, held = [True], []
     monkeypatch.setattr(RunFolder, "loops", property(lambda run: loops[0]))
     recording = dead(watching, holds=HOLDS, guardian=held)
@@ -166,7 +166,7 @@ def test_a_dead_run_stays_listed_while_its_output_is_not_safe(orphan):
     lambda page: page.put(PageField.RELIEVED, 1),
     lambda page: page.put(PageField.GUARDIAN_PHASE, GuardianPhase.DONE),
 ], ids=["relieved", "guardian ended"])  # fmt: skip
-def test_a_dead_run_is_forgotten_once_its_output_is_settled(orphan, settle):
+def test_dead_run_is_removed_when_its_output_is_safe(orphan, settle):
     settle(page_of(orphan))
     assert recover_dead_runs() == []
     assert runs() == []
@@ -178,7 +178,7 @@ def test_a_living_run_is_left_alone(tmp_path):
         assert folder.path.is_dir()
 
 
-def test_what_can_not_be_recovered_is_kept(dead):
+def test_folder_that_cannot_be_recovered_is_kept(dead):
     recording = dead()
     cut = recording.read_bytes()
     recording.unlink()
@@ -199,7 +199,7 @@ def ready(folder):
 
 
 @pytest.mark.parametrize("fill", [lambda folder: None, ready])
-def test_a_run_that_never_started_is_cleared_away(dead, fill):
+def test_run_that_never_started_is_removed(dead, fill):
     recording = dead(fill)
     recording.write_bytes(b"")
     (orphan,) = recover_dead_runs()
@@ -208,7 +208,7 @@ def test_a_run_that_never_started_is_cleared_away(dead, fill):
     assert runs() == []
 
 
-def test_what_stood_under_the_name_of_a_run_that_never_started_stays(dead):
+def test_older_recording_of_a_run_that_never_started_is_kept(dead):
     recording = dead(ready)
     before = recording.read_bytes()
     (orphan,) = recover_dead_runs()
@@ -217,7 +217,7 @@ def test_what_stood_under_the_name_of_a_run_that_never_started_stays(dead):
     assert runs() == []
 
 
-def test_what_can_not_be_recovered_can_be_dismissed(dead, tmp_path):
+def test_folder_that_cannot_be_recovered_can_be_dismissed(dead, tmp_path):
     dead().unlink()
     (orphan,) = recover_dead_runs()
     dismiss(orphan.name)

@@ -37,7 +37,7 @@ def made(tmp_path, name="sine"):
     return run_folder(name, tmp_path / "a.mcap", 12.0)
 
 
-def test_run_is_seen_while_it_lives_and_gone_afterwards(tmp_path):
+def test_run_is_listed_while_it_is_active(tmp_path):
     with made(tmp_path) as (folder, _):
         (found,) = runs()
         assert found == folder
@@ -49,7 +49,7 @@ def test_run_is_seen_while_it_lives_and_gone_afterwards(tmp_path):
     assert list(base_folder().iterdir()) == []
 
 
-def test_a_folder_that_is_kept_is_a_dead_run_to_the_next_command(tmp_path):
+def test_kept_folder_is_a_dead_run(tmp_path):
     with made(tmp_path) as (folder, _):
         folder.keep(recorded=False)
     assert runs() == [folder]
@@ -82,7 +82,7 @@ def test_folder_that_others_can_write_is_refused(tmp_path):
         base_folder()
 
 
-def test_half_made_folders_are_passed_over(tmp_path):
+def test_incomplete_folders_are_ignored(tmp_path):
     (base_folder() / "empty").mkdir()
     broken = base_folder() / "broken"
     broken.mkdir()
@@ -95,7 +95,7 @@ GOOD = {"name": "x", "experiment": "x", "recording": "/x.mcap", "supervisor": 7,
 
 
 @pytest.mark.parametrize("wrong", [{"more": 1}, {"holds": None}], ids=str)
-def test_a_card_of_another_version_is_passed_over_with_one_warning(tmp_path, caplog, wrong):
+def test_card_of_another_version_is_ignored_with_one_warning(tmp_path, caplog, wrong):
     card = base_folder() / "broken" / "run.json"
     card.parent.mkdir()
     card.write_text(json.dumps({**GOOD, **wrong}))
@@ -128,7 +128,7 @@ def test_run_whose_folder_was_removed_is_found_until_it_ends(tmp_path):
     assert not folder.alive
 
 
-def test_what_a_process_has_of_a_removed_folder_is_kept(tmp_path):
+def test_open_files_of_a_removed_folder_are_restored(tmp_path):
     with made(tmp_path) as (folder, _):
         (folder.path / "ring").write_text("samples")
         with folder.ring.open():
@@ -145,7 +145,7 @@ def test_what_a_process_has_of_a_removed_folder_is_kept(tmp_path):
             assert runs() == []  # although this process still has the removed files open
 
 
-def test_no_run_looks_dead_or_can_be_taken_over_while_its_folder_is_removed(tmp_path, monkeypatch):
+def test_run_is_not_dead_while_its_folder_is_removed(tmp_path, monkeypatch):
     seen, taken, remove = [], [], shutil.rmtree
 
     def look_then_remove(path, **options):
@@ -161,7 +161,7 @@ def test_no_run_looks_dead_or_can_be_taken_over_while_its_folder_is_removed(tmp_
     assert not any(taken)
 
 
-def test_samples_of_a_dead_process_of_the_same_number_stay(tmp_path):
+def test_folder_of_a_dead_process_with_the_same_id_is_kept(tmp_path):
     """A new run takes another folder: the old one's ring may be all there is of its samples."""
     old = base_folder() / f"sine-{os.getpid()}"
     old.mkdir()
@@ -172,7 +172,7 @@ def test_samples_of_a_dead_process_of_the_same_number_stay(tmp_path):
     assert (old / "ring").read_text() == "samples"
 
 
-def test_folder_that_can_not_be_made_is_one_message(tmp_path, monkeypatch):
+def test_folder_that_cannot_be_created_is_one_message(tmp_path, monkeypatch):
     monkeypatch.setattr(
         "pathlib.Path.write_text", Mock(side_effect=OSError(28, "No space left on device"))
     )
@@ -181,7 +181,7 @@ def test_folder_that_can_not_be_made_is_one_message(tmp_path, monkeypatch):
     assert list(base_folder().iterdir()) == []
 
 
-def test_no_descriptor_left_is_not_taken_for_a_dead_run(tmp_path, monkeypatch):
+def test_missing_descriptors_do_not_look_like_a_dead_run(tmp_path, monkeypatch):
     with made(tmp_path) as (folder, _):
         monkeypatch.setattr(os, "open", Mock(side_effect=OSError(24, "Too many open files")))
         for look in (lambda: folder.alive, lambda: folder.supervised):
@@ -199,7 +199,7 @@ def places(tmp_path, monkeypatch):
     return found
 
 
-def test_somebody_in_the_first_place_locks_nobody_out(tmp_path, places, monkeypatch):
+def test_folder_of_another_user_in_the_first_place_is_skipped(tmp_path, places, monkeypatch):
     trap = tmp_path / "trap"
     trap.mkdir(mode=0o700)
     places[0].symlink_to(trap)
@@ -292,7 +292,7 @@ def test_a_device_of_another_user_is_refused_and_can_be_taken_over(squatted, cap
         refused(name, match="in use")  # its holder is this user's
 
 
-def test_a_process_that_waits_for_another_user_keeps_nothing(squatted):
+def test_waiting_process_releases_all_locks(squatted):
     name, _ = squatted
     first = f"{NAME}a"
     assert first < name

@@ -30,14 +30,14 @@ DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 NOON = time.struct_time((2026, 1, 2, 12, 0, 5, 4, 2, 0))
 
 
-def test_a_name_that_is_taken_gets_a_number(tmp_path):
+def test_used_name_gets_a_number(tmp_path):
     assert default_output("sine", tmp_path, NOON) == tmp_path / "sine-20260102-120005.mcap"
     (tmp_path / "sine-20260102-120005.mcap").symlink_to(tmp_path / "nowhere")
     (tmp_path / "sine-20260102-120005-2.mcap").touch()
     assert default_output("sine", tmp_path, NOON) == tmp_path / "sine-20260102-120005-3.mcap"
 
 
-def test_the_folder_of_the_experiment_is_made(tmp_path):
+def test_recording_folder_is_created(tmp_path):
     folder = tmp_path / "new" / "runs"
     checked = checked_experiment(DEMO, [f"recording.folder={folder}"])
     assert output_of(checked, tmp_path / "mine.mcap") == tmp_path / "mine.mcap"
@@ -46,7 +46,7 @@ def test_the_folder_of_the_experiment_is_made(tmp_path):
     assert folder.is_dir()
 
 
-def test_a_folder_that_can_not_be_made_is_said(tmp_path):
+def test_recording_folder_that_cannot_be_created_is_reported(tmp_path):
     (tmp_path / "file").touch()
     checked = checked_experiment(DEMO, [f"recording.folder={tmp_path / 'file' / 'runs'}"])
     with pytest.raises(InputError, match="Not a directory"):
@@ -72,13 +72,13 @@ def test_a_killed_run_of_a_device_is_recovered_before_its_state_is_read(monkeypa
 BUDGET = ["limits.rms_current_a=2.0", "limits.thermal_time_constant_s=1.0"]
 
 
-def test_a_recording_is_known_by_what_it_is_of(experiment, tmp_path):
+def test_recording_is_identified_by_experiment_and_model(experiment, tmp_path):
     result = unpaced(experiment, [], tmp_path / "a.mcap")
     assert completed_key(result.path) == RunKey.of(load_experiment(experiment))
     assert completed_key(result.path) != RunKey.of(load_experiment(experiment, ["block=10"]))
 
 
-def test_what_was_not_completed_has_no_key(experiment, tmp_path):
+def test_incomplete_recording_has_no_key(experiment, tmp_path):
     fault = ["device.fault={kind: sensor_nan, at_sample: 100}"]
     assert completed_key(unpaced(experiment, fault, tmp_path / "a.mcap").path) is None
     (tmp_path / "text.mcap").write_text("no recording")
@@ -86,7 +86,7 @@ def test_what_was_not_completed_has_no_key(experiment, tmp_path):
     assert completed_key(tmp_path / "absent.mcap") is None
 
 
-def test_a_recording_says_the_coil_s_heat_before_and_after(experiment, tmp_path):
+def test_recording_has_the_heat_of_the_coil_before_and_after(experiment, tmp_path):
     first = read(unpaced(experiment, BUDGET, tmp_path / "a.mcap").path)
     left = float(first.end["coil_heat_a2"])
     assert float(first.run["coil_heat_a2"]) == 0.0
@@ -96,7 +96,7 @@ def test_a_recording_says_the_coil_s_heat_before_and_after(experiment, tmp_path)
     assert float(again.end["coil_heat_a2"]) > left
 
 
-def test_no_log_takes_the_place_of_another_file(tmp_path):
+def test_log_does_not_replace_another_file(tmp_path):
     log = tmp_path / "run.log"
     assert unused(log, ".") == log
     log.write_text("mine")
@@ -118,7 +118,7 @@ def answering(monkeypatch):
     return says
 
 
-def test_errors_come_back_as_they_are(answering):
+def test_errors_are_passed_between_processes(answering):
     answering(
         "from hilctl.base.errors import ConfigError, ConfigProblem\n"
         "error = ConfigError([ConfigProblem('x.yaml:1', 'name', 'is required')])\n"

@@ -110,7 +110,7 @@ def test_every_block_comes_once_and_in_order(latency):
 
 
 @pytest.mark.parametrize("output", [7.0, -9.5])
-def test_a_run_from_elsewhere_ramps_in_and_is_replayed(tmp_path, output):
+def test_run_from_another_output_ramps_in_and_replays(tmp_path, output):
     plain = read(run_unpaced(checked_experiment(UNCOMPENSATED, SHORT), tmp_path / "a.mcap").path)
     checked = checked_experiment(UNCOMPENSATED, [*SHORT, f"device.output_at_open={output}"])
     result = run_unpaced(checked, tmp_path / "b.mcap")
@@ -137,14 +137,14 @@ def test_a_run_from_elsewhere_ramps_in_and_is_replayed(tmp_path, output):
     (["device.output_at_open=null"], "safe.at_start is required"),
     (["device.output_at_open=30.0"], "output is 30 A"),
 ])  # fmt: skip
-def test_a_start_that_is_not_known_or_can_not_be_is_refused(tmp_path, settings, words):
+def test_unknown_or_impossible_start_is_refused(tmp_path, settings, words):
     checked = checked_experiment(UNCOMPENSATED, [*SHORT, *settings])
     with pytest.raises(InputError, match=words):
         run_unpaced(checked, tmp_path / "run.mcap")
     assert list(tmp_path.iterdir()) == []
 
 
-def test_a_device_that_can_not_know_is_vouched_for(tmp_path):
+def test_start_of_a_device_without_readback_is_set_by_the_user(tmp_path):
     settings = ["device.output_at_open=null", "safe.at_start=0.0"]
     result = run_unpaced(
         checked_experiment(UNCOMPENSATED, [*SHORT, *settings]), tmp_path / "r.mcap"
@@ -152,7 +152,7 @@ def test_a_device_that_can_not_know_is_vouched_for(tmp_path):
     assert result.code == "completed"
 
 
-def test_real_devices_are_refused_before_a_file_is_made(tmp_path):
+def test_real_devices_are_refused_before_a_file_is_created(tmp_path):
     checked = checked_experiment(UNCOMPENSATED, SHORT)
     info = replace(checked.loaded.device.info, simulated=False)
     loaded = replace(checked.loaded, device=SimpleNamespace(info=info))
@@ -161,7 +161,7 @@ def test_real_devices_are_refused_before_a_file_is_made(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_in_memory_and_in_a_file_it_is_the_same_run(tmp_path):
+def test_run_in_memory_equals_the_recorded_run(tmp_path):
     checked = checked_experiment(UNCOMPENSATED, SHORT)
     recorded = read(run_unpaced(checked, tmp_path / "run.mcap").path).samples
     loaded, begun = checked.loaded, checked.begun
@@ -175,7 +175,7 @@ def test_in_memory_and_in_a_file_it_is_the_same_run(tmp_path):
 
 
 @pytest.mark.parametrize("name", ["terfenol_sine_6a_uncompensated", "terfenol_sine_6a"])
-def test_the_end_of_a_recording_says_what_came_out(tmp_path, name):
+def test_end_of_a_recording_has_the_metrics_of_the_report(tmp_path, name):
     """As a report does, so that nobody has to read the samples for it."""
     soft = [f"waveform.soft_{end}_s=0.05" for end in ("start", "end")]
     checked = checked_experiment(UNCOMPENSATED.with_stem(name), [*SHORT, *soft])

@@ -58,12 +58,12 @@ def answers(monkeypatch):
 @pytest.mark.parametrize(
     ("name", "found"), [("sine", "sine"), ("sine-", "sine-2"), ("tri", "triangle")]
 )
-def test_a_run_is_found_by_its_name_or_the_beginning_of_it(going, name, found):
+def test_run_is_found_by_its_name_or_a_prefix(going, name, found):
     going("sine", "sine-2", "triangle")
     assert find_run(name).card.name == found
 
 
-def test_what_is_not_one_run_is_refused_with_those_there_are(going):
+def test_ambiguous_run_is_refused_with_the_names(going):
     going("sine-1", "sine-2")
     with pytest.raises(InputError, match="sine-1, sine-2"):
         find_run(None)
@@ -74,7 +74,7 @@ def test_what_is_not_one_run_is_refused_with_those_there_are(going):
         find_run(None)
 
 
-def test_status_is_given_of_runs_that_do_not_answer(answers, monkeypatch):
+def test_status_of_runs_that_do_not_answer(answers, monkeypatch):
     assert status_of(run("a"))["command"] == "status"
     dead, left = run("a", supervised=False, alive=False), run("a", supervised=False)
     assert status_of(dead) == {"name": "a", "state": "dead"}
@@ -86,7 +86,7 @@ def test_status_is_given_of_runs_that_do_not_answer(answers, monkeypatch):
     assert status_of(run("a")) == {"name": "a", "state": "not answering", "error": "no answer"}
 
 
-def test_all_runs_are_requested_to_stop_before_one_is_waited_for(answers, monkeypatch):
+def test_all_runs_are_stopped_before_waiting_for_one(answers, monkeypatch):
     done, clock = [], SteppingClock()
     chosen = [run("a"), run("b"), run("c"), run("d", alive=False)]
 
@@ -121,7 +121,7 @@ def test_all_runs_are_requested_to_stop_before_one_is_waited_for(answers, monkey
     ("gain=1_0", "gain must be a number: '1_0'"),
     ("inverse=0", "inverse must be in or out: '0'"),
 ])  # fmt: skip
-def test_what_is_no_setting_is_refused(text, said):
+def test_invalid_assignments_are_refused(text, said):
     with pytest.raises(InputError, match=said):
         assigned(["offset=1", text])
 
@@ -196,7 +196,7 @@ def test_a_process_that_holds_no_lock_is_left_alone(process):
     assert process.poll() is None
 
 
-def test_the_lock_is_looked_at_once_the_process_is_held(process, monkeypatch):
+def test_lock_is_checked_after_the_process_is_opened(process, monkeypatch):
     """The other way round, the number could become another's in between."""
     order = []
     opened = os.pidfd_open
@@ -236,7 +236,7 @@ def recovered(monkeypatch):
 DEAD = run("sine-7", supervised=False, alive=False)
 
 
-def test_what_was_done_is_logged(recovered, caplog):
+def test_recovery_is_logged(recovered, caplog):
     result = RecoveredRun("sine-7", Path("a.mcap"), safe=False, text="supervisor and loop died")
     recovered(result, run("a"), run("b", supervised=False, recorded=True))
     assert caplog.messages == []  # one has a supervisor, the other a guardian alone

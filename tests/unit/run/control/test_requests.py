@@ -73,14 +73,14 @@ def asked(requests, **message):
     return requests.answer(json.dumps(message).encode())
 
 
-def test_status_says_where_the_run_stands(requests, page):
+def test_status_has_state_sample_and_gain(requests, page):
     found = asked(requests, command="status")
     assert (found["state"], found["sample"], found["gain"]) == ("running", 500, 1.0)
     page.put(PageField.STOP, Stop.CTRL_C)
     assert asked(requests, command="status")["state"] == "stopping"
 
 
-def test_nobody_stops_a_run_by_its_socket(requests):
+def test_socket_accepts_no_stop(requests):
     """Others may keep it busy: a stop has a signal of its own."""
     with pytest.raises(InputError, match="one of"):
         asked(requests, command="stop")
@@ -239,7 +239,7 @@ def test_a_change_reaches_the_loop_whole(changes, page):
     assert (changes.gain, changes.offset) == (0.5, 0.0)
 
 
-def test_the_second_of_two_follows_the_first(changes, page, waits):
+def test_second_change_follows_the_first(changes, page, waits):
     wanted = []
 
     def meanwhile():
@@ -277,7 +277,7 @@ def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, nu
     assert page.get(PageField.TUNE_WANTED) == 1
 
 
-def test_a_loop_that_takes_no_change_is_not_waited_for_without_end(changes, waits):
+def test_waiting_for_a_loop_that_takes_no_change_has_a_limit(changes, waits):
     """The client would have given up."""
     change(changes, gain=0.1)
     with pytest.raises(InputError, match="previous change"):
@@ -311,7 +311,7 @@ def test_a_queue_that_is_full_takes_no_more(changes, page, waits):
     assert len(made) == 17
 
 
-def test_the_inverse_goes_out_and_stays_there_until_it_is_wanted_in(changes, page, experiment):
+def test_inverse_stays_bypassed_until_it_is_enabled(changes, page, experiment):
     line = experiment.forecast.line
     numbers = [PageField.TUNE_INVERSE_SHARE, PageField.TUNE_LINE_SLOPE, PageField.TUNE_LINE_AT_ZERO]
     for at, wanted, share in (
@@ -324,7 +324,7 @@ def test_the_inverse_goes_out_and_stays_there_until_it_is_wanted_in(changes, pag
         take(page, at)
 
 
-def test_an_inverse_that_is_not_there_can_not_go_out(page):
+def test_bypass_without_a_compensator_is_refused(page):
     changes = Changes(experiment_of(), page)
     with pytest.raises(InputError, match="set: inverse: "):
         change(changes, inverse="out")
@@ -390,7 +390,7 @@ def test_the_voltage_is_bounded_too(gain, offset, refused):
     assert ("V" in bound_refusal(made, gain, offset, bypassed=False)) == refused
 
 
-def test_the_straight_line_is_bounded_while_it_gives_commands():
+def test_bypass_is_bounded_while_it_gives_commands():
     made = experiment_of(RDPI, 10.0, -10.0, peak_a=5.5)
     assert bound_refusal(made, 0.3, 30.0, bypassed=False) == ""
     assert "5.5 A" in bound_refusal(made, 0.3, 30.0, bypassed=True)
@@ -401,7 +401,7 @@ def test_the_straight_line_is_bounded_while_it_gives_commands():
 @pytest.mark.parametrize(
     ("gain", "offset"), [(1.0, 0.0), (0.3, 5.0), (2.0, 0.0), (-1.5, -3.0), (1.0, 10.0)]
 )
-def test_thecommand_range_is_that_of_a_run_with_the_new_amplitude(model, hz, gain, offset):
+def test_command_range_is_that_of_a_run_with_the_new_amplitude(model, hz, gain, offset):
     made = experiment_of(model, 10.0, -10.0, hz)
     low, high = sorted(gain * end + offset for end in made.reference.span)
     after = experiment_of(model, abs(gain) * 10.0, gain * -10.0 + offset, hz)
@@ -526,7 +526,7 @@ def test_an_error_of_one_request_ends_no_other(server, tmp_path, caplog):
     assert json.loads(exchange(tmp_path, b"hello\n"))["ok"]
 
 
-def test_clients_without_a_thread_cost_no_place(server, tmp_path, monkeypatch, caplog):
+def test_clients_without_a_thread_take_no_place(server, tmp_path, monkeypatch, caplog):
     with monkeypatch.context() as patch:
         patch.setattr(
             threading.Thread, "start", Mock(side_effect=RuntimeError("can't start new thread"))
@@ -538,7 +538,7 @@ def test_clients_without_a_thread_cost_no_place(server, tmp_path, monkeypatch, c
     assert json.loads(exchange(tmp_path, b"hello\n"))["ok"]
 
 
-def test_another_user_is_sent_away(server, tmp_path, monkeypatch):
+def test_connection_of_another_user_is_closed(server, tmp_path, monkeypatch):
     monkeypatch.setattr("hilctl.run.control.requests.is_same_user", lambda connection: False)
     with connect(tmp_path) as client:
         assert answer_of(client) == b""
@@ -560,7 +560,7 @@ def test_a_path_that_cannot_be_used_is_an_error(tmp_path):
     assert list(tmp_path.iterdir()) == []
 
 
-def test_what_can_not_go_out_is_said():
+def test_output_that_cannot_be_bypassed_is_reported():
 
     def refused(line=LinearBypass(), wanted="out", model=1, tracking_error_um=None):  # noqa: B008
         limits = SimpleNamespace(tracking_error_um=tracking_error_um)

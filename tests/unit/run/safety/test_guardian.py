@@ -37,7 +37,6 @@ from hilctl.run.shared.shared_page import (
     PageSlot,
     Phase,
     SafeActionResult,
-    SharedPage,
 )
 from tests.fakes import FakeInfo
 
@@ -134,7 +133,7 @@ def gave_up(page, output):
     lambda page: None,
     lambda page: page.put(PageField.PHASE, Phase.FAILED),
 ], ids=["died", "broke"])  # fmt: skip
-def test_a_loop_without_a_safe_output_is_followed_by_the_safe_value(guarded, left):
+def test_safe_value_is_set_after_a_loop_that_died_or_failed(guarded, left):
     left(guarded.page)
     guarded.loop.kill()
     guarded.guard()
@@ -144,7 +143,7 @@ def test_a_loop_without_a_safe_output_is_followed_by_the_safe_value(guarded, lef
 
 
 @pytest.mark.parametrize("output", ["unknown", "set"])
-def test_a_loop_that_ended_without_a_confirmed_output_leaves_a_watch(guarded, output):
+def test_guardian_continues_after_an_unconfirmed_output(guarded, output):
     """A command of the loop may still be executed, so that only the user ends the guardian."""
     gave_up(guarded.page, output)
     guarded.loop.kill()
@@ -169,28 +168,7 @@ def test_a_loop_that_hangs_is_killed_before_the_device_is_touched(guarded, how):
     assert guarded.page.safe_result().hung
 
 
-def test_a_loop_that_goes_on_is_left_alone(guarded, monkeypatch):
-    page, put = [], SharedPage.put
-
-    def noted(self, field, value):
-        put(self, field, value)
-        if self is not guarded.page:  # a thread of an earlier test may still be driving its device
-            return
-        page.append((field, value))
-        if len(page) == 6:
-            guarded.loop.kill()
-
-    monkeypatch.setattr(SharedPage, "put", noted)
-    guarded.guard()
-    assert page[1] == (PageField.GUARDIAN_PHASE, GuardianPhase.WATCHING)
-    heartbeats_ns = [value for field, value in page if field == PageField.GUARDIAN_HEARTBEAT_NS]
-    assert [field for field, _ in page[:6]].count(PageField.GUARDIAN_HEARTBEAT_NS) == 5
-    assert heartbeats_ns == sorted(set(heartbeats_ns))
-    assert guarded.page.safe_result().confirmed
-    assert not guarded.page.safe_result().hung
-
-
-def test_a_loop_that_hangs_may_end_a_call_before_the_device_is_touched(guarded, monkeypatch):
+def test_killed_loop_may_finish_a_call_before_the_device_is_touched(guarded, monkeypatch):
     """The kernel ends it, where it is not held up: a device may take one connection only."""
     done = []
 
@@ -213,7 +191,7 @@ def test_a_loop_that_hangs_may_end_a_call_before_the_device_is_touched(guarded, 
     assert done[-2:] == [signal.SIGKILL, LAST_CALL_MS]
 
 
-def test_a_loop_that_ended_by_itself_is_left_to_what_it_said(guarded):
+def test_guardian_accepts_the_outcome_of_the_loop(guarded):
     guarded.page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed", 0))
     guarded.loop.kill()
     guarded.guard()
@@ -221,7 +199,7 @@ def test_a_loop_that_ended_by_itself_is_left_to_what_it_said(guarded):
     assert guarded.page.safe_result() is None
 
 
-def test_a_loop_that_is_stopped_after_its_end_is_killed_only(guarded):
+def test_loop_stopped_after_its_end_is_only_killed(guarded):
     guarded.page.leave_outcome(LoopOutcome("completed", "completed", 7, "confirmed", 0))
     guarded.loop.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, guarded.loop.pid, os.WSTOPPED | os.WNOWAIT)
@@ -238,7 +216,7 @@ def test_a_loop_that_died_before_the_start_has_moved_nothing(guarded):
     assert guarded.device.asked == []
 
 
-def test_the_way_is_a_ramp_from_the_last_command(guarded):
+def test_guardian_ramps_from_the_last_command(guarded):
     guarded.page.put_float(PageField.OUTPUT_AT_START, 1.25)
     guarded.loop.kill()
     guarded.guard()
@@ -248,7 +226,7 @@ def test_the_way_is_a_ramp_from_the_last_command(guarded):
     assert values[-1] == 0.25
 
 
-def test_a_ramp_that_another_process_began_is_gone_on_with(guarded):
+def test_guardian_continues_the_ramp_of_another_process(guarded):
     """It would step back to the last command otherwise."""
     guarded.page.put_float(PageField.OUTPUT_AT_START, 4.0)
     guarded.page.note_safe_write(0.3)
@@ -257,7 +235,7 @@ def test_a_ramp_that_another_process_began_is_gone_on_with(guarded):
     assert max(value for value, _ in guarded.device.asked) <= 0.3
 
 
-def test_it_keeps_trying_until_the_user_ends_it(guarded):
+def test_guardian_keeps_trying_until_the_user_ends_it(guarded):
     guarded.device.error = DeviceError("no answer")
     guarded.loop.kill()
     with ended_after(guarded.device, calls=3) as tries:
@@ -268,9 +246,7 @@ def test_it_keeps_trying_until_the_user_ends_it(guarded):
 
 
 @pytest.mark.parametrize("error", [MemoryError(), ZeroDivisionError("a bug")])
-def test_a_guardian_that_cannot_drive_the_device_says_so_and_tries_again(
-    guarded, monkeypatch, error
-):
+def test_guardian_that_cannot_drive_the_device_reports_it_and_retries(guarded, monkeypatch, error):
     """The supervisor drives the device then, unless it has died too."""
     monkeypatch.setattr(guardian, "_AGAIN_S", 0.0)
     said, write_text = [], guarded.page.write_text
@@ -374,7 +350,7 @@ def test_a_relieved_guardian_ends_and_leaves_the_device_alone(guarded, claimed):
     assert not guarded.page.safe_result().final
 
 
-def test_a_guardian_stands_by_while_the_supervisor_acts(guarded, monkeypatch):
+def test_guardian_waits_while_the_supervisor_acts(guarded, monkeypatch):
     monkeypatch.setattr(guardian, "_WAIT_S", 0.0)
     page, waits = guarded.page, []
     page.put(PageField.STANDS_IN, 1)
@@ -390,7 +366,7 @@ def test_a_guardian_stands_by_while_the_supervisor_acts(guarded, monkeypatch):
     assert page.safe_result().confirmed
 
 
-def test_it_gives_signs_of_life_while_the_device_keeps_it(guarded, monkeypatch):
+def test_guardian_gives_heartbeats_while_the_device_blocks(guarded, monkeypatch):
     """The supervisor would take it for dead otherwise, and reach for the device as well."""
     go_on, seen = threading.Event(), set()
 
@@ -435,7 +411,7 @@ def written(tmp_path):
     ("name: x", "the experiment has no device"),
     ("device: {kind: simulated_terfenol}", "not enough memory"),
 ])  # fmt: skip
-def test_a_device_that_can_not_be_made_is_said_before_the_start(
+def test_device_that_cannot_be_created_is_reported_before_the_start(
     written, monkeypatch, experiment, said
 ):
     if "memory" in said:
@@ -450,7 +426,7 @@ def test_the_device_is_made_of_the_experiment_alone():
 
 
 @pytest.mark.parametrize("limit", [None, 65536])
-def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monkeypatch, limit):
+def test_guardian_prepares_its_process_for_real_time(written, guarded, monkeypatch, limit):
     """No signal ends it, it stays in memory where it may, and both threads are quick."""
     done, descriptors = [], set(DESCRIPTORS.iterdir())
     process = SimpleNamespace(
@@ -475,7 +451,7 @@ def test_it_prepares_for_a_machine_that_does_nothing_else(written, guarded, monk
     assert set(DESCRIPTORS.iterdir()) <= descriptors
 
 
-def test_refused_real_time_is_no_reason_to_leave_the_coil(written, guarded, monkeypatch):
+def test_guardian_works_without_real_time(written, guarded, monkeypatch):
     refused = Mock(side_effect=OSError(1, "Operation not permitted"))
     process = Mock(lockable_bytes=lambda: None, lock_memory=refused, set_fifo=refused)
     monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
@@ -484,7 +460,7 @@ def test_refused_real_time_is_no_reason_to_leave_the_coil(written, guarded, monk
     assert written.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.WATCHING
 
 
-def test_it_brings_no_numba_along():
+def test_guardian_imports_no_numba():
     code = (
         "import sys, hilctl.run.safety.guardian, hilctl_drivers.dac\n"
         "sys.exit(any(name in sys.modules for name in ('numba', 'scipy', 'mcap')))"
@@ -543,39 +519,39 @@ def test_silence_beyond_the_limit_is_a_hang(watched, numbers, stopped, after_s):
     assert watched.hangs_after_s() == pytest.approx(after_s, abs=0.011)
 
 
-def test_heartbeat_starts_the_time_again(watched):
+def test_heartbeat_restarts_the_time(watched):
     assert not any(watched.looks(*[0.01 * k for k in range(100)]))
     watched.page.put(PageField.LOOP_HEARTBEAT_NS, 2)
     assert not any(watched.looks(*[0.99 + 0.01 * k for k in range(100)]))
 
 
-def test_machine_that_stood_still_is_no_hang(watched):
+def test_suspended_machine_is_no_hang(watched):
     """Not even late between two slow ticks, after many looks at the same heartbeat."""
     assert not any(watched.looks(*[0.01 * k for k in range(10)], 30.0, 30.02))
 
 
-def test_loop_that_does_not_run_yet_or_any_more_does_not_hang(watched):
+def test_loop_before_its_start_or_after_its_end_does_not_hang(watched):
     """Opening and closing a device may take its time."""
     for phase in (Phase.STARTING, Phase.READY, *ENDED_PHASES):
         watched.page.put(PageField.PHASE, phase)
         assert not any(watched.looks(*[0.01 * k for k in range(1000)]))
 
 
-def test_a_stop_is_looked_at_several_times(watched):
+def test_stopped_loop_is_checked_several_times(watched):
     """Where all processes were stopped and go on, this one may be the first of them."""
     watched.stopped = True
     assert not any(watched.looks(0.0, *[5.0 + 0.01 * k for k in range(39)]))
     assert watched.looks(5.4, 5.41)[-1]
 
 
-def test_a_loop_that_never_comes_to_its_first_tick_is_found(watched):
+def test_loop_without_a_first_tick_is_detected(watched):
     """Nothing has moved until then, so that it gets more time: from the first look on."""
     watched.page.put(PageField.LOOP_HEARTBEAT_NS, 0)
     assert not any(watched.looks(*[9e5 + 0.01 * k for k in range(3100)]))
     assert watched.looks(*[9e5 + 31.0 + 0.01 * k for k in range(5)])[-1]
 
 
-def test_the_kernel_says_whether_a_process_is_stopped():
+def test_stopped_process_is_detected():
     code = (
         "import ctypes, os, signal; ctypes.CDLL(None).prctl(15, b') T ('); "
         "os.kill(os.getpid(), signal.SIGSTOP)"
@@ -606,7 +582,7 @@ def act(tmp_path):
     return start
 
 
-def test_the_caller_is_not_blocked(act):
+def test_safe_action_does_not_block_its_caller(act):
     go_on, asked = threading.Event(), []
 
     def make_safe(value):
@@ -621,7 +597,7 @@ def test_the_caller_is_not_blocked(act):
     assert action.page.last_safe_write() == 0.5
 
 
-def test_an_action_goes_on_until_it_is_ended(act):
+def test_safe_action_continues_until_it_is_ended(act):
     asked = threading.Event()
 
     def make_safe(value):
@@ -636,7 +612,7 @@ def test_an_action_goes_on_until_it_is_ended(act):
 
 
 @pytest.mark.parametrize("error", [KeyError("x"), MemoryError()])
-def test_a_failure_of_this_process_is_no_answer_of_the_device(act, error):
+def test_failure_of_the_process_is_no_answer_of_the_device(act, error):
     action = act(Mock(side_effect=error))
     action.result(30.0)
     assert type(error).__name__ in action.failed

@@ -55,13 +55,13 @@ def experiment(tmp_path):
     return path
 
 
-def test_the_experiment_s_safe_value_is_put_out_and_confirmed(amplifier, experiment):
+def test_safe_value_of_the_experiment_is_set_and_confirmed(amplifier, experiment):
     assert put_safe(experiment, []).to_mapping()["output_safe"] is True
     assert put_safe(experiment, ["safe.value=-1.5"]).value == -1.5
     assert amplifier.asked == [0.5, -1.5]
 
 
-def test_an_output_that_is_not_confirmed_is_not_called_safe(amplifier, experiment):
+def test_unconfirmed_output_is_not_safe(amplifier, experiment):
     amplifier.error = "no answer"
     found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
     assert (found["output_safe"], found["error"]) == (False, "no answer")
@@ -77,7 +77,7 @@ def test_a_device_without_confirmation_is_sent_the_value(amplifier, experiment, 
     assert (found["output_safe"], found["output_state"]) == (False, "sent")
 
 
-def test_a_device_that_a_run_holds_is_left_to_it(amplifier, experiment):
+def test_device_in_use_by_a_run_is_not_touched(amplifier, experiment):
     with (
         held_devices(("tcp:10.9.8.7:502",)),
         pytest.raises(InputError, match="in use"),
@@ -86,7 +86,7 @@ def test_a_device_that_a_run_holds_is_left_to_it(amplifier, experiment):
     assert amplifier.asked == []
 
 
-def test_no_room_for_a_lock_is_no_reason_to_leave_current_flowing(
+def test_safe_value_is_set_even_without_a_lock(
     amplifier, experiment, monkeypatch, tmp_path, caplog
 ):
     (tmp_path / "runs").write_text("")

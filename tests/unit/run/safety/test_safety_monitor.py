@@ -124,7 +124,7 @@ def run(ring, monkeypatch):
         assert made.safety._action.end(wait_s=5.0)
 
 
-def test_a_guardian_that_is_awake_does_it(run, page):
+def test_responsive_guardian_acts(run, page):
     for _ in range(5):
         run.look(ended=True)
     assert (run.log, run.safety.result) == ([], None)
@@ -135,7 +135,7 @@ def test_a_guardian_that_is_awake_does_it(run, page):
 
 
 @pytest.mark.parametrize("what", ["dead", "silent", "starting"])
-def test_where_the_guardian_can_not_the_supervisor_does(run, what):
+def test_supervisor_acts_if_the_guardian_cannot(run, what):
     """It kills the other one first: no two of them may hold the device."""
     guardian = run.guardians[0]
     run.look()
@@ -152,7 +152,7 @@ def test_where_the_guardian_can_not_the_supervisor_does(run, what):
     assert sorted(run.priorities) == [0, 81, 81]
 
 
-def test_a_guardian_that_was_just_done_when_it_was_killed_is_believed(run, page):
+def test_result_of_a_guardian_killed_after_its_action_counts(run, page):
     guardian = run.guardians[0]
     guardian.kill = lambda wait_s: page.leave_safe_result(
         SafeActionResult(hung=False, output="confirmed")
@@ -169,7 +169,7 @@ def acting(run, page, **result):
     page.leave_safe_result(SafeActionResult(hung=False, final=False, **result))
 
 
-def test_a_guardian_that_keeps_trying_is_left_to_it(run, page):
+def test_guardian_that_keeps_trying_is_not_replaced(run, page):
     acting(run, page, output="unknown", error="no answer")
     run.look(ended=True)
     run.look(ended=True, passed_ms=4_000)
@@ -201,7 +201,7 @@ def unconfirmed(run):
     return run
 
 
-def test_what_the_supervisor_cannot_confirm_is_left_to_the_waiting_guardian(unconfirmed, page):
+def test_unconfirmed_output_is_handed_to_the_waiting_guardian(unconfirmed, page):
     guardian = unconfirmed.guardians[-1]
     assert unconfirmed.watched == [1, "act"]
     assert page.get(PageField.STANDS_IN)
@@ -218,7 +218,7 @@ def test_what_the_supervisor_cannot_confirm_is_left_to_the_waiting_guardian(unco
 
 
 @pytest.mark.parametrize("ended", [False, True])
-def test_if_no_guardian_can_be_started_the_supervisor_goes_on_until_the_user_ends_it(
+def test_supervisor_continues_without_a_guardian_until_it_is_stopped(
     unconfirmed, ended, monkeypatch
 ):
     monkeypatch.setattr(module, "_REPEAT_NS", 0)
@@ -247,7 +247,7 @@ def test_run_ends_if_no_process_can_act(run, monkeypatch, how):
     assert not run.safety.close()
 
 
-def test_a_loop_that_said_how_it_ended_is_left_alone(run, page):
+def test_loop_with_an_outcome_is_left_alone(run, page):
     page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed", 0))
     run.guardians[0].ended = True  # as it does by itself
     for _ in range(5):
@@ -255,7 +255,7 @@ def test_a_loop_that_said_how_it_ended_is_left_alone(run, page):
     assert (run.log, run.events, run.safety.result) == ([], [], None)
 
 
-def test_a_hanging_loop_is_found_here_too(run):
+def test_supervisor_detects_a_hanging_loop(run):
     run.look()
     looks = 0
     while not run.log:
@@ -277,7 +277,7 @@ def test_a_loop_that_continues_before_any_process_acts_is_left_alone(run, page):
     assert run.safety.result is None
 
 
-def test_a_guardian_is_awake_for_50_ms_after_its_heartbeat(run):
+def test_guardian_is_responsive_for_50_ms_after_its_heartbeat(run):
     run.look(ended=True)
     run.look(ended=True, passed_ms=50 - 1e-6, awake=False)
     assert run.log == []
@@ -285,7 +285,7 @@ def test_a_guardian_is_awake_for_50_ms_after_its_heartbeat(run):
     assert run.log[:2] == ["guardian killed", "loop killed"]
 
 
-def test_a_guardian_that_is_done_is_believed_until_the_process_is_gone(run, page):
+def test_result_of_a_guardian_counts_after_the_loop_has_ended(run, page):
     run.look()
     run.guardians[0].phase = GuardianPhase.DONE
     page.leave_safe_result(SafeActionResult(hung=True, output="confirmed"))
@@ -302,7 +302,7 @@ def heartbeat(run, page):
 
 
 @pytest.mark.parametrize("how", ["died", "is silent"])
-def test_a_lost_guardian_is_said_and_another_one_started(run, page, how):
+def test_lost_guardian_is_reported_and_restarted(run, page, how):
     run.look()
     if how == "died":
         run.guardians[0].ended = True
@@ -347,7 +347,7 @@ def test_a_guardian_has_a_minute_to_start(run, page):
     assert len(run.guardians) == 2, "a minute was pause enough"
 
 
-def test_one_that_never_comes_to_watch_is_not_started_without_a_pause(run, page):
+def test_guardian_that_never_watches_is_restarted_after_a_pause(run, page):
     run.look()
     run.guardians[0].ended = True
     for _ in range(100):
@@ -361,7 +361,7 @@ def test_one_that_never_comes_to_watch_is_not_started_without_a_pause(run, page)
     assert len(run.events) == 2, "each loss is said once"
 
 
-def test_one_that_dies_at_once_is_started_again_after_the_pause(run, page):
+def test_guardian_that_dies_immediately_is_restarted_after_a_pause(run, page):
     run.guardians[0].ended = True
     heartbeat(run, page)
     run.look_alive(page, passed_ms=5_000 - 1e-6)
@@ -370,7 +370,7 @@ def test_one_that_dies_at_once_is_started_again_after_the_pause(run, page):
     assert len(run.guardians) == 2
 
 
-def test_one_that_can_not_be_started_again_is_said(run, page):
+def test_guardian_that_cannot_be_restarted_is_reported(run, page):
     run.look()
     run.guardians[0].ended = True
     run.fail_start = OSError(11, "Resource temporarily unavailable")

@@ -36,7 +36,7 @@ def push(ring, number):
     return ring.answered(born(ring, number))
 
 
-def test_blocks_come_out_as_they_went_in(tmp_path):
+def test_blocks_are_read_as_written(tmp_path):
     ring = make(tmp_path)
     other = SampleRing(ring.path)
     assert push(ring, 1)
@@ -60,7 +60,7 @@ def test_full_ring_refuses_and_keeps_what_it_has(tmp_path):
     assert push(ring, 9)
 
 
-def test_many_come_out_some_at_a_time(tmp_path, monkeypatch):
+def test_many_blocks_are_read_in_batches(tmp_path, monkeypatch):
     monkeypatch.setattr(module, "_BATCH_SAMPLES", 2 * BLOCK)
     ring = make(tmp_path, slots=7)
     other = SampleRing(ring.path)
@@ -99,7 +99,7 @@ def test_any_order_of_pushes_and_pops(tmp_path_factory, steps):
     assert taken == accepted
 
 
-def test_damaged_slot_is_not_taken(tmp_path):
+def test_damaged_slot_is_skipped(tmp_path):
     ring = make(tmp_path)
     other = SampleRing(ring.path)
     for number in range(3):
@@ -120,7 +120,7 @@ def test_damaged_slot_is_not_taken(tmp_path):
     (BlockHeader.DEADLINE_NS, LONGEST_NS + 1),
     (BlockHeader.LATE_NS, -LONGEST_NS - 1),
 ])  # fmt: skip
-def test_slot_that_no_recording_may_hold_is_not_taken(tmp_path, field, value):
+def test_slot_with_impossible_numbers_is_skipped(tmp_path, field, value):
     """Recorded, it would keep all the rest from being read."""
     ring = make(tmp_path)
     for number in range(3):
@@ -131,7 +131,7 @@ def test_slot_that_no_recording_may_hold_is_not_taken(tmp_path, field, value):
     assert ring.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [6]
 
 
-def test_what_was_not_released_is_there_for_the_next_consumer(tmp_path):
+def test_unreleased_blocks_are_read_by_the_next_consumer(tmp_path):
     ring = make(tmp_path)
     first = SampleRing(ring.path)
     push(ring, 0)
@@ -144,7 +144,7 @@ def test_what_was_not_released_is_there_for_the_next_consumer(tmp_path):
     assert second.pop().heads[:, BlockHeader.FIRST_SAMPLE].tolist() == [3, 6]
 
 
-def test_blocks_that_were_sent_outlive_their_loop(tmp_path):
+def test_sent_blocks_remain_after_the_loop_dies(tmp_path):
     ring = SampleRing.create(
         tmp_path / "ring", slots=4, block=BLOCK, state_size=STATE, latency_blocks=2
     )
@@ -166,7 +166,7 @@ def test_blocks_that_were_sent_outlive_their_loop(tmp_path):
     assert other.unanswered(12) is None
 
 
-def test_block_without_room_lives_in_a_spare_slot(tmp_path):
+def test_block_uses_a_spare_slot_if_the_ring_is_full(tmp_path):
     ring = SampleRing.create(
         tmp_path / "ring", slots=2, block=BLOCK, state_size=STATE, latency_blocks=1
     )
@@ -180,7 +180,7 @@ def test_block_without_room_lives_in_a_spare_slot(tmp_path):
     assert other.unanswered(0) is None
 
 
-def test_block_that_is_not_due_is_never_seen(tmp_path):
+def test_unpublished_block_is_never_read(tmp_path):
     ring = make(tmp_path)
     other = SampleRing(ring.path)
     assert not ring.answered(born(ring, 7, due=False))
@@ -192,7 +192,7 @@ def test_block_that_is_not_due_is_never_seen(tmp_path):
 @given(st.binary(min_size=1, max_size=64), st.integers(0, 60_000))
 @example(b"\x00\x00\x00\x00\x00\x00\x80\x00\x00\x01", 57)  # numbers 2**63 from each other
 @example(b"\xff" * 7 + b"\x7f", 56)
-def test_damaged_ring_is_survived(tmp_path_factory, garbage, at):
+def test_reading_a_damaged_ring_raises_nothing(tmp_path_factory, garbage, at):
     ring = make(tmp_path_factory.mktemp("ring"), slots=3)
     other = SampleRing(ring.path)
     for number in range(3):
@@ -221,14 +221,14 @@ def test_other_files_are_refused(tmp_path):
     "field", [PageField.SLOTS, PageField.BLOCK, PageField.STATE_SIZE, PageField.SPARE]
 )
 @pytest.mark.parametrize("value", [-1, 0, 2**40])
-def test_sizes_that_can_not_be_are_refused(tmp_path, field, value):
+def test_impossible_sizes_are_refused(tmp_path, field, value):
     ring = make(tmp_path)
     ring.page.put(field, value)
     with pytest.raises(ValueError, match=r"damaged|shorter"):
         SampleRing(ring.path)
 
 
-def test_slots_are_handed_out_clean(tmp_path):
+def test_claimed_slots_are_cleared(tmp_path):
     ring = make(tmp_path, slots=3)
     other = SampleRing(ring.path)
     for number in range(20):
@@ -243,7 +243,7 @@ def test_slots_are_handed_out_clean(tmp_path):
             other.release()
 
 
-def test_who_looks_on_sees_what_stands_there_and_takes_nothing(tmp_path):
+def test_observer_reads_blocks_without_consuming_them(tmp_path):
     ring = make(tmp_path, slots=4)
     consumer, seen = SampleRing(ring.path), SampleRing(ring.path, look_only=True)
     for number in range(3):
@@ -262,7 +262,7 @@ def test_who_looks_on_sees_what_stands_there_and_takes_nothing(tmp_path):
         seen.page.put(PageField.STOP, 1)
 
 
-def test_a_block_that_is_cleaned_or_damaged_under_the_copy_is_left_out(tmp_path):
+def test_block_overwritten_during_the_copy_is_skipped(tmp_path):
     ring = make(tmp_path, slots=4)
     for number in range(4):
         push(ring, number)
@@ -280,7 +280,7 @@ def test_a_block_that_is_cleaned_or_damaged_under_the_copy_is_left_out(tmp_path)
     assert (batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist(), after) == ([6], 4)
 
 
-def test_cursors_are_published_after_what_they_say(tmp_path, monkeypatch):
+def test_cursors_are_published_after_their_data(tmp_path, monkeypatch):
     ring, seen = make(tmp_path), []
 
     def publishing(page):

@@ -18,7 +18,7 @@ def sides():
     return SharedPage(memory), SharedPage(memory)
 
 
-def test_each_text_has_a_place_of_its_own(sides):
+def test_each_text_has_its_own_slot(sides):
     one, other = sides
     for place in PageSlot:
         one.write_text(place, f"{place.name}: öffnen")
@@ -30,7 +30,7 @@ def test_each_text_has_a_place_of_its_own(sides):
     assert other.read_text(PageSlot.ERROR) == r"\udcff/e.yaml: no such file"
 
 
-def test_events_come_once_and_are_cut_to_what_fits(sides):
+def test_events_are_read_once_and_truncated(sides):
     one, other = sides
     for sample in range(40):
         one.push_event(Event(sample, "error", "test", "ü" * 1000, {"number": 0.5}))
@@ -56,7 +56,7 @@ def test_outcome_counts_only_at_the_end(sides):
     assert other.outcome() is None
 
 
-def test_values_that_do_not_fit_are_left_out(sides):
+def test_values_that_do_not_fit_are_omitted(sides):
     one, other = sides
     values = {f"weight_{number}": 1.0 / 3.0 for number in range(500)}
     one.push_event(Event(1, "info", "test", "text", values))
@@ -64,7 +64,7 @@ def test_values_that_do_not_fit_are_left_out(sides):
     assert (event.code, event.text, event.values) == ("test", "text", {})
 
 
-def test_who_looks_on_sees_the_newest_events_and_takes_none(sides):
+def test_observer_reads_the_newest_events_without_consuming_them(sides):
     one, other = sides
     for number in range(3):
         one.push_event(Event(number, "info", f"e{number}", ""))
@@ -74,7 +74,7 @@ def test_who_looks_on_sees_the_newest_events_and_takes_none(sides):
     assert len(one.pop_events()) == 3
 
 
-def test_notes_are_seen_by_all_and_the_oldest_give_way(sides):
+def test_notes_are_read_by_all_and_the_oldest_are_dropped(sides):
     one, other = sides
     for number in range(40):
         one.leave_note(Event(number, "info", "mark", f"{number} " + "x" * 2000))
@@ -85,7 +85,7 @@ def test_notes_are_seen_by_all_and_the_oldest_give_way(sides):
     assert [note.text for note in other.look_at_notes(after)[0]] == ["more"]
 
 
-def test_what_a_run_took_passes_to_the_other_side(sides):
+def test_resource_usage_is_shared(sides):
     """Nothing is known of a loop that died before it could say it."""
     one, other = sides
     assert other.usage() is None
