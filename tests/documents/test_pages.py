@@ -50,7 +50,7 @@ def options(name):
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=named)
-def test_links_lead_somewhere(path):
+def test_links_have_targets(path):
     for target, anchor in LINK.findall(path.read_text(encoding="utf-8")):
         base = DOCS if target.startswith("/") else path.parent
         found = (base / target.lstrip("/")) if target else path
@@ -62,7 +62,7 @@ def test_links_lead_somewhere(path):
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=named)
-def test_files_are_there(path):
+def test_named_files_exist(path):
     if path.parent == DECISIONS:
         return
     folders = (ROOT, path.parent)
@@ -79,7 +79,7 @@ def commands(path):
 
 
 @pytest.mark.parametrize("path", DOCUMENTS, ids=named)
-def test_commands_and_their_options_are_there(path):
+def test_named_commands_and_options_exist(path):
     for words in commands(path):
         if words[0] in OF_ITSELF:
             continue

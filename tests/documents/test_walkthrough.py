@@ -54,7 +54,7 @@ def test_tutorial(copy):
     walked(text_of("docs/tutorial.md"), copy)
 
 
-def test_what_is_printed_is_held_against_what_is_said(tmp_path):
+def test_printed_output_is_compared_with_the_document(tmp_path):
     right = "```sh\nprintf 'a 1\\nb 2\\nc 3\\n'\n```\nsays\n```text\na ...\n...\nc 3\n```\n"
     assert walk(right, tmp_path, {"PATH": os.environ["PATH"]}) == []
     for broken in ("c 4", "c 3\nd"):

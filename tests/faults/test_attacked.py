@@ -37,7 +37,7 @@ def samples(commands, unanswered=0):
     return Samples.of(np.arange(len(commands)), values, flags)
 
 
-def test_a_ramp_takes_no_time_beyond_itself(tmp_path):
+def test_ramp_itself_is_not_counted(tmp_path):
     found = log(tmp_path, ramp(START_A))
     assert found.beyond_ramp_s(0) == pytest.approx(0.0, abs=PERIOD_S)
     assert found.largest_step(0) < 1.0
@@ -48,13 +48,13 @@ def test_a_ramp_takes_no_time_beyond_itself(tmp_path):
     ([1.0, 0.0] + [1.0] * 98 + ramp(1.0), 0.2),
     ([1.0] * 100, math.inf),
 ])  # fmt: skip
-def test_what_comes_late_or_moves_again_is_seen(tmp_path, currents_a, beyond_s):
+def test_late_or_repeated_motion_is_detected(tmp_path, currents_a, beyond_s):
     """The output must stay at the safe value."""
     assert log(tmp_path, currents_a).beyond_ramp_s(0) == pytest.approx(beyond_s, abs=3 * PERIOD_S)
 
 
 @pytest.mark.parametrize("before", [1, 50])
-def test_a_jump_is_seen(tmp_path, before):
+def test_jump_is_detected(tmp_path, before):
     """A step is detected even after a constant output."""
     found = log(tmp_path, [4.0] * before + [0.0])
     assert found.largest_step(0) == pytest.approx(4.0 / (RAMP_A_PER_S * (2 * PERIOD_S + 0.01)))
@@ -74,7 +74,7 @@ def test_writes_that_are_not_recorded_are_counted(tmp_path, commands, unanswered
     assert found.lost(samples(commands, unanswered), math.inf) == lost
 
 
-def test_without_a_recording_all_that_moved_is_lost(tmp_path):
+def test_without_a_recording_all_samples_are_lost(tmp_path):
     assert log(tmp_path, [START_A, START_A]).lost(None, math.inf) == 0
     assert log(tmp_path, [START_A, 2.0, 1.0]).lost(None, math.inf) == 2
     assert log(tmp_path, [START_A, 2.0, 1.0]).lost(None, 0.0) == 0
@@ -98,6 +98,6 @@ def test_each_of_them_is_a_violation(change):
     assert not Attack(phase="run", **{**GOOD, **change}).is_good(0.2, 1.0)
 
 
-def test_a_reader_that_is_missing_is_said(monkeypatch, tmp_path):
+def test_missing_reader_is_reported(monkeypatch, tmp_path):
     monkeypatch.setattr(other_reader, "PEERS", tmp_path)
     assert other_reader.verdict(tmp_path / "run.mcap", 1) == other_reader.NOT_INSTALLED

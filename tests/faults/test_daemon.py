@@ -214,7 +214,7 @@ def crowd(socket_path, size):
             thread.join()
 
 
-def test_a_crowd_keeps_nobody_else_out(going):
+def test_requests_work_with_many_clients(going):
     """Status and set are answered, and the run goes on undisturbed."""
     (run,) = runs()
     before = await_state("running")
@@ -227,7 +227,7 @@ def test_a_crowd_keeps_nobody_else_out(going):
     assert after["recorded_samples"] > before["recorded_samples"]
 
 
-def test_two_changes_at_once_are_both_made(going):
+def test_two_simultaneous_changes_are_both_applied(going):
     """The second begins once the loop has taken the first, and leads to what both asked for."""
     commands = [["set", "gain=0.5", "--over", "0.5"], ["set", "offset=0.5", "--over", "0.1"]]
     await_state("running")
@@ -241,7 +241,7 @@ def test_two_changes_at_once_are_both_made(going):
     assert (after["gain"], after["offset"], after["missing_samples"]) == (1.0, 0.0, 0)
 
 
-def test_a_crowd_does_not_keep_a_run_from_being_stopped(background):
+def test_stop_works_with_many_clients(background):
     """Its supervisor is told by a signal, which no client can take the place of."""
     await_state("running")
     (run,) = runs()
@@ -258,7 +258,7 @@ def test_second_run_into_the_same_recording_is_refused(going):
     assert "is recording" in text
 
 
-def test_refused_experiment_is_told_at_once(tmp_path):
+def test_detached_run_of_an_invalid_experiment_is_refused(tmp_path):
     """What the foreground would refuse, the background refuses too, and leaves nothing."""
     path = written(tmp_path, sample_rate_hz=-1)
     text = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach", code=2)
@@ -266,7 +266,7 @@ def test_refused_experiment_is_told_at_once(tmp_path):
     assert sorted(each.name for each in tmp_path.iterdir()) == ["experiment.yaml"]
 
 
-def test_a_run_that_does_not_start_is_told_as_in_the_foreground(tmp_path):
+def test_detached_run_that_does_not_start_reports_the_same_error(tmp_path):
     """Here a device that nothing answers for: the same error and exit code, and no recording."""
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
@@ -325,7 +325,7 @@ def test_short_stop_of_the_supervisor_loses_nothing(going):
     assert after["missing_samples"] == 0
 
 
-def test_run_that_was_left_in_peace_is_whole(going):
+def test_long_run_is_complete_after_all_requests(going):
     """After all that, it ends by its safe ramp, and every sample is there and replays."""
     await_state("running")
     assert hilctl("stop")["ended"]

@@ -149,7 +149,7 @@ def test_disk_that_stays_full(tmp_path, on_failure, whole):
     assert not runs()
 
 
-def test_disk_that_stands_still_longer_than_the_ring_ends_the_run(tmp_path):
+def test_stall_longer_than_the_ring_ends_the_run(tmp_path):
     """The loop ramps down before the ring is full: nothing is lost."""
     run = start(tmp_path, code=stall(2.0), on_failure="stop")
     printed = end(run, 3)
@@ -162,7 +162,7 @@ def test_disk_that_stands_still_longer_than_the_ring_ends_the_run(tmp_path):
     assert replay(recording).identical
 
 
-def test_run_that_goes_on_counts_what_a_slow_disk_lost(tmp_path):
+def test_continued_run_counts_the_samples_lost_by_a_slow_disk(tmp_path):
     """The ring holds one second; the number of lost samples is reported and recorded."""
     run = start(tmp_path, code=stall(2.5), on_failure="go_on")
     printed = end(run, 0)
@@ -179,7 +179,7 @@ def test_run_that_goes_on_counts_what_a_slow_disk_lost(tmp_path):
     assert replay(recording).identical
 
 
-def test_stall_that_the_ring_bridges_loses_nothing(tmp_path):
+def test_stall_shorter_than_the_ring_loses_nothing(tmp_path):
     """A stall within the ring's capacity is no fault."""
     printed = end(start(tmp_path, code=stall(3.0), ring_s=10.0), 0)
     assert printed["reason"] == "waveform completed"
@@ -210,7 +210,7 @@ def test_wall_clock_that_is_set_changes_nothing(tmp_path):
     assert SECONDS <= (ended.time_ns - start_ns) * 1e-9 < SECONDS + 60.0
 
 
-def test_memory_that_is_not_to_be_had_is_told(tmp_path):
+def test_missing_memory_is_one_message(tmp_path):
     """Without memory for the ring the run does not start, leaves no file and prints one line."""
 
     def nothing() -> None:
@@ -224,7 +224,7 @@ def test_memory_that_is_not_to_be_had_is_told(tmp_path):
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_a_full_disk_below_standard_output_does_not_make_a_good_run_a_fault(tmp_path):
+def test_full_disk_of_standard_output_is_no_fault_of_the_run(tmp_path):
     """A full disk on standard output is reported and does not change the run's result."""
     output = tmp_path / "run.mcap"
     command = [sys.executable, "-m", "hilctl", "run", str(DEMO)]

@@ -24,7 +24,7 @@ def logged_out(tmp_path):
     stop_all()
 
 
-def test_it_is_still_found_changed_watched_and_stopped(logged_out):
+def test_run_is_found_changed_watched_and_stopped_after_a_logout(logged_out):
     """All commands work, and the recording is complete."""
     assert await_state("running")["recording"] == str(logged_out)
     pipe = subprocess.PIPE

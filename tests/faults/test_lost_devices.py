@@ -66,7 +66,7 @@ def abandoned(emulate, run, profile):
     return module
 
 
-def test_the_guardian_goes_on_after_the_command_and_says_so(abandoned):
+def test_guardian_continues_after_the_command_and_is_reported(abandoned):
     """The command returns; the output is safe within one retry of the device's return."""
     result = abandoned.result
     assert (result["output_state"], result["guardian_active"]) == ("unknown", True)
@@ -82,7 +82,7 @@ def test_the_guardian_goes_on_after_the_command_and_says_so(abandoned):
 
 
 @pytest.mark.long
-def test_safe_by_hand_relieves_the_guardian_and_gives_back_what_it_cannot_do(abandoned):
+def test_manual_safe_relieves_the_guardian_and_hands_back_an_unconfirmed_output(abandoned):
     found = said("safe", abandoned.experiment, code=3)
     assert (found["output_state"], found["guardian_active"]) == ("unknown", True)
     assert [run["state"] for run in active()] == [SETTING_SAFE]
@@ -98,7 +98,7 @@ def test_safe_by_hand_relieves_the_guardian_and_gives_back_what_it_cannot_do(aba
 
 
 @pytest.mark.long
-def test_safe_by_hand_starts_a_dead_guardian_again(abandoned):
+def test_manual_safe_restarts_a_dead_guardian(abandoned):
     """Which ``hilctl status`` lists, and ``hilctl stop`` ends."""
     (run,) = runs()
     assert signal_guardian(run, signal.SIGKILL)
@@ -133,7 +133,7 @@ def test_the_user_can_end_the_guardian(abandoned):
     assert all(run["state"] != SETTING_SAFE for run in active())
 
 
-def test_the_recording_is_complete_while_the_guardian_still_tries(emulate, run, profile):
+def test_recording_is_complete_while_the_guardian_still_tries(emulate, run, profile):
     module = Module(emulate, profile("rtu_module"), pulled_at=10**9)
     section = {**MODULE, "profile": profile("rtu_module"), **module.place, "framing": "rtu"}
     started = run({**section, "timeout_s": 0.5}, sample_rate_hz=100)

@@ -47,7 +47,7 @@ def hilctl(tmp_path):
     ('"$@" >&- 2>&- <&-', {}),
     ('"$@"', {"COLUMNS": "1", "LC_ALL": "C", "PYTHONUTF8": "0", "PYTHONCOERCECLOCALE": "0"}),
 ], ids=["private", "head", "closed", "no locale"])  # fmt: skip
-def test_runs_with_little(hilctl, tmp_path, shell, environment):
+def test_run_with_few_resources_completes(hilctl, tmp_path, shell, environment):
     """A run completes with few file descriptors, no home, no terminal and no reader."""
     ended = hilctl(shell, **environment)
     assert ended.returncode == 0, ended.stderr
@@ -55,7 +55,7 @@ def test_runs_with_little(hilctl, tmp_path, shell, environment):
 
 
 @pytest.mark.parametrize("shell", ['ulimit -n 9; "$@"', 'ulimit -v 300000; "$@"'])
-def test_too_little_is_one_message(hilctl, tmp_path, shell):
+def test_missing_resources_are_one_message(hilctl, tmp_path, shell):
     """Too few descriptors or too little memory: one message, no motion, no recording."""
     ended = hilctl(shell)
     assert ended.returncode == 3, ended.stderr
@@ -112,7 +112,7 @@ def test_a_full_disk_at_the_start_is_one_message(hilctl, own_mounts, tmp_path, b
     ("mkfifo", False),
     ("ln -s $PWD/mine", True),
 ])  # fmt: skip
-def test_what_another_user_has_put_in_the_way(hilctl, own_mounts, tmp_path, nobody, what, second):
+def test_obstacles_of_another_user_are_reported(hilctl, own_mounts, tmp_path, nobody, what, second):
     """Files of another user are neither used nor followed; the run avoids or names them."""
     (tmp_path / "mine").mkdir(mode=0o700)
     place, other = f"/dev/shm/hilctl-{os.geteuid()}", f"/run/user/{os.geteuid()}"
@@ -132,7 +132,7 @@ def test_what_another_user_has_put_in_the_way(hilctl, own_mounts, tmp_path, nobo
         assert "HILCTL_RUNS" in ended.stderr
 
 
-def test_device_folder_of_somebody_else_is_not_written_through(hilctl, tmp_path):
+def test_device_folder_of_another_user_is_not_followed(hilctl, tmp_path):
     """A link in place of a lock file is not followed."""
     theirs = tmp_path / "theirs"
     theirs.mkdir(mode=0o700)
@@ -144,7 +144,7 @@ def test_device_folder_of_somebody_else_is_not_written_through(hilctl, tmp_path)
     assert not (tmp_path / "run.mcap").exists()
 
 
-def test_a_name_full_of_markup_and_escapes_is_shown_as_it_is(hilctl, tmp_path):
+def test_markup_and_control_characters_in_a_name_are_escaped(hilctl, tmp_path):
     """Markup and escapes in a folder's name neither end a run nor reach the terminal."""
     folder = tmp_path / "[x] \x1b[31m" / "[" / "x]"
     folder.mkdir(parents=True)
@@ -154,7 +154,7 @@ def test_a_name_full_of_markup_and_escapes_is_shown_as_it_is(hilctl, tmp_path):
     assert "\x1b" not in ended.stdout + ended.stderr
 
 
-def test_errors_of_programs_name_it_too(tmp_path):
+def test_errors_in_programs_name_the_experiment(tmp_path):
     """With --json the message is plain text in JSON."""
     ended = commands.hilctl("report", "\x1b[2J[/x].mcap", "--json", code=2, cwd=tmp_path)
     assert json.loads(ended.stdout)["error"].startswith("\x1b[2J[/x].mcap: ")

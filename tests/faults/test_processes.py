@@ -107,7 +107,7 @@ def test_stop_beyond_the_limit_ends_the_run(tmp_path):
     assert printed["output_safe"]
 
 
-def test_supervisor_that_falls_silent_ends_the_run(tmp_path):
+def test_silent_supervisor_ends_the_run(tmp_path):
     """Before the ring is full the loop ramps down by itself; nothing is lost."""
     run = begun(tmp_path)
     os.kill(run.process.pid, signal.SIGSTOP)
@@ -126,7 +126,7 @@ def test_supervisor_that_falls_silent_ends_the_run(tmp_path):
 
 
 @pytest.mark.parametrize("seed", [1, 2])
-def test_garbage_in_the_ring_is_survived(tmp_path, seed):
+def test_run_ends_despite_garbage_in_the_ring(tmp_path, seed):
     """Whatever is overwritten there, the run comes to an end, and its recording can be read."""
     run = begun(tmp_path)
     (folder,) = runs()
@@ -144,7 +144,7 @@ def test_garbage_in_the_ring_is_survived(tmp_path, seed):
     assert read(run.output).end["reason"] == printed["reason"]
 
 
-def test_both_processes_dead_is_told_and_recovered(tmp_path):
+def test_death_of_both_processes_is_reported_and_recovered(tmp_path):
     """Nobody is left to make the output safe: the next command says so, and saves the samples."""
     run = begun(tmp_path)
     os.kill(run.process.pid, signal.SIGSTOP)

@@ -146,7 +146,7 @@ def test_killed_loop_is_noticed(tmp_path):
     assert replay(recording).identical
 
 
-def test_killed_supervisor_takes_the_loop_along(tmp_path):
+def test_loop_ramps_down_if_the_supervisor_is_killed(tmp_path):
     """The loop ramps down and leaves when its supervisor dies; the file can be read."""
     run = started(tmp_path)
     run.await_size()
@@ -166,7 +166,7 @@ def test_killed_supervisor_takes_the_loop_along(tmp_path):
     assert recover_dead_runs() == []
 
 
-def test_nothing_stays_in_memory(tmp_path):
+def test_run_leaves_nothing_in_memory(tmp_path):
     """The ring and the reference are gone after a run."""
     run = started(tmp_path, waveform=short(0.5))
     assert run.ended()[0] == 0
@@ -212,7 +212,7 @@ def test_the_longest_name_and_folder_are_no_error_after_the_start(tmp_path, monk
     assert states
 
 
-def test_a_supervisor_that_breaks_ends_the_run_by_its_ramp(tmp_path, monkeypatch):
+def test_failing_supervisor_ends_the_run_by_its_ramp(tmp_path, monkeypatch):
     """Coil, ring and recording are seen to, whatever is wrong; no sample is lost."""
     calls = []
 
@@ -232,7 +232,7 @@ def test_a_supervisor_that_breaks_ends_the_run_by_its_ramp(tmp_path, monkeypatch
 
 
 @pytest.mark.parametrize("how", ["raises", "stands still"])
-def test_a_display_that_fails_costs_no_run(tmp_path, how):
+def test_failing_display_does_not_end_the_run(tmp_path, how):
     """A terminal keeps nobody waiting."""
     released = threading.Event()
 
@@ -252,7 +252,7 @@ def test_a_display_that_fails_costs_no_run(tmp_path, how):
 
 @pytest.mark.parametrize("how", ["deleted", "renamed", "truncated"])
 @pytest.mark.parametrize("on_failure", ["stop", "go_on"])
-def test_if_the_recording_is_gone_the_run_is_a_fault(tmp_path, how, on_failure):
+def test_lost_recording_is_a_fault(tmp_path, how, on_failure):
     """It ends by its safe ramp, or goes on; what the ring holds is kept."""
     output, moved = tmp_path / "run.mcap", tmp_path / "moved.mcap"
     done = []

@@ -130,7 +130,7 @@ def test_pulled_adapter_takes_the_port_along(meet, kind):
 
 
 @pytest.mark.parametrize(("kind", "events"), [("dcon", 80), ("cobs", 80), ("fifo", 300)])
-def test_dead_loop_is_followed_by_a_message(meet, boards, kind, events):
+def test_safe_value_is_sent_after_the_death_of_the_loop(meet, boards, kind, events):
     """The supervisor sets the safe value without a reboot of the board."""
     for name in ("cobs", "fifo"):
         path = Path(boards[name])
@@ -161,7 +161,7 @@ def test_dead_host_is_noticed_by_the_device(meet, kind, events):
     assert started.readable_samples() > 20
 
 
-def test_silent_reader_is_named(emulate, run):
+def test_silent_sensor_device_is_named(emulate, run):
     """With two devices the message names the one that did not answer."""
     sensor = "agilent_34970a:AI101"
     device = emulate("kepco_bop", "--sensor", sensor, lines=2)

@@ -103,9 +103,7 @@ input()
 """
 
 
-def test_a_user_who_only_takes_the_name_keeps_nobody_from_the_safe_value(
-    nobody, device, run, tmp_path
-):
+def test_user_who_binds_the_name_does_not_prevent_the_safe_value(nobody, device, run, tmp_path):
     """A run can ignore the name, and ``hilctl safe`` does."""
     section = device.section
     name = f"tcp:{section['host']}:{section['tcp_port']}"
@@ -126,7 +124,7 @@ def test_a_user_who_only_takes_the_name_keeps_nobody_from_the_safe_value(
 
 
 @pytest.mark.long
-def test_of_two_users_with_two_names_of_a_device_one_is_refused(neighbour, device, run):
+def test_second_user_with_another_name_of_the_device_is_refused(neighbour, device, run):
     chance = random.Random(TRIALS)
     for trial in range(TRIALS):
         theirs = neighbour.start("--set", "device.host=localhost", "--overwrite")

@@ -36,7 +36,7 @@ def run(tmp_path):
     pytest.param(STAGED, ("sample_rate_hz=10000", "block=1"), marks=pytest.mark.long),
     (OMEGA, ("sample_rate_hz=10000", "block=1")),
 ], ids=["staged-50", "staged-1", "omega-1"])  # fmt: skip
-def test_offset_and_gain_that_have_changed_are_taken_out(run, model, rate):
+def test_changed_offset_and_gain_are_compensated(run, model, rate):
     """An actuator that moved by 5 um and shows 6 % more: as good as before, and replayed."""
     length = "waveform.duration_s=2.5"
     _, fresh = run(model, *rate, length)
@@ -55,7 +55,7 @@ def test_offset_and_gain_that_have_changed_are_taken_out(run, model, rate):
     assert replay(recording).identical
 
 
-def test_parameters_are_recorded_and_said(run):
+def test_adapted_parameters_are_recorded_and_reported(run):
     result, recording = run(STAGED, "waveform.duration_s=1.5", *WRONG, ADAPTATION)
     events = [event for event in recording.events if event.code == ADAPTED]
     assert len(events) == 2
@@ -77,7 +77,7 @@ def test_an_integrator_keeps_the_offset(run):
     assert replay(recording).identical
 
 
-def test_noise_of_the_rest_is_taken(run):
+def test_noise_at_rest_is_measured(run):
     quick = "condition={cycles: 3, frequency_hz: 20.0}"
     setting = "adaptation={time_constant_s: 0.2}"
     result, recording = run(STAGED, "waveform.duration_s=1.0", *WRONG, quick, setting)

@@ -55,7 +55,7 @@ def test_the_model_meets_both_wings(found):
     assert found.model.bias == 0.0
 
 
-def test_one_model_holds_for_a_bias_that_it_was_not_found_on(found):
+def test_model_is_valid_at_another_bias(found):
     others = [
         loop(2.5, frequency_hz, bias_a) for bias_a in (2.5, 4.5) for frequency_hz in (10, 100)
     ]

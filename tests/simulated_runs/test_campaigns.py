@@ -215,7 +215,7 @@ timing: {max_missed_share: 1}
 
 
 @pytest.mark.timeout(600)
-def test_killed_in_real_time_it_loses_one_run_and_goes_on(tmp_path):
+def test_killed_campaign_loses_one_run_and_continues(tmp_path):
     (tmp_path / "rig.yaml").write_text(RIG)
     (tmp_path / "few.yaml").write_text(FEW)
     runs = tmp_path / "runs"
@@ -304,5 +304,5 @@ class TestFiguresAndTrends:
             ("compensation_complex", {"before_and_after", "error_history"}),
         ],
     )  # fmt: skip
-    def test_each_campaign_has_the_figures_that_it_is_run_for(self, series, name, figures):
+    def test_each_campaign_has_its_figures(self, series, name, figures):
         assert figures <= {sheet.name for sheet in sheets_of(series(name))}

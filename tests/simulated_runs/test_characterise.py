@@ -68,7 +68,7 @@ def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
     ("device.magnet=false", "no_bias"),
     ("device.load_kg=90.0", "resonance"),
 ])  # fmt: skip
-def test_what_is_wrong_with_a_rig_is_named(tmp_path, setting, code):
+def test_problems_of_a_rig_are_named(tmp_path, setting, code):
     quick = ["sample_rate_hz=20000", "block=20"]
     campaign = CharacterisationRunner(
         RIG, [*quick, setting], tmp_path, None, StudyHost(run=unpaced)

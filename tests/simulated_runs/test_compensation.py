@@ -34,7 +34,7 @@ def test_nothing_is_lost_at_50_khz(sweep):
     assert sweep.samples == 420_000
 
 
-def test_its_process_stays_small_and_its_ticks_find_their_memory(sweep):
+def test_loop_has_little_memory_and_no_page_faults(sweep):
     """All that a tick needs is in RAM before the first, the ring's 27 MB included."""
     loop = sweep.processes["loop"]
     assert loop.resident_bytes < 300e6

@@ -46,7 +46,7 @@ def rms_error_percent(recording):
     [(OMEGA, DRIFT), (STAGED, "device.vary={strain: 1.1}")],
     ids=["drift", "strain"],
 )
-def test_what_the_model_does_not_know_is_taken_out(run, model, wrong):
+def test_feedback_removes_model_errors(run, model, wrong):
     plain, plainly_recorded = run(model, wrong)
     result, recording = run(model, wrong, FEEDBACK)
     assert plain.code == result.code == "completed"

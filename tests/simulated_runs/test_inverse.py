@@ -58,7 +58,7 @@ def figures(recording, from_s):
     return peak_hysteresis_percent(*cycle), np.ptp(cycle[1])
 
 
-def test_the_loop_opens_and_closes_again(switched):
+def test_bypassed_inverse_is_enabled_again(switched):
     recording, _ = switched
     (before, stroke_um), (out, stroke_out_um), (back, _) = (
         figures(recording, at_s) for at_s in (0.6, OUT_S + 0.5, IN_S + 0.5)
@@ -80,7 +80,7 @@ def test_no_step_is_beyond_the_slew_and_it_replays_bit_for_bit(switched):
     assert replay(recording).identical
 
 
-def test_it_replays_in_pieces(switched, monkeypatch):
+def test_bypass_replays_in_pieces(switched, monkeypatch):
     """A fade may begin in one piece and end in another, and its event stand behind its samples."""
     recording, _ = switched
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 3000)
@@ -88,7 +88,7 @@ def test_it_replays_in_pieces(switched, monkeypatch):
     assert replay(RecordingStream(recording.path)) == replay(recording)
 
 
-def test_without_its_events_it_is_not_replayed(switched):
+def test_bypass_without_its_events_is_not_replayed(switched):
     recording, _ = switched
     for events in ((), recording.events[:1], recording.events[1:]):
         with pytest.raises(DataError, match="inverse"):
@@ -99,7 +99,7 @@ def test_without_its_events_it_is_not_replayed(switched):
     "feedback={kind: integral, limit_um: 5.0, bandwidth_hz: 2.0}",
     "adaptation={time_constant_s: 0.3, noise_um: 0.03}",
 ])  # fmt: skip
-def test_what_learns_from_the_error_stands_still_meanwhile(learns, tmp_path, monkeypatch):
+def test_feedback_and_adaptation_pause_while_bypassed(learns, tmp_path, monkeypatch):
     rate_hz, cycle = 10_000, 500
     settings = [f"sample_rate_hz={rate_hz}", "block=10", "waveform.amplitude=15.0", learns]
     settings += ["waveform.frequency_hz=20", "waveform.duration_s=2.5"]

@@ -49,7 +49,7 @@ print(json.dumps({"late": late, "samples": samples}))
 """
 
 
-def test_none_is_loaded_while_a_loop_runs(tmp_path):
+def test_no_kernel_is_loaded_while_a_loop_is_active(tmp_path):
     runs = [
         (str(CONFIGS / name), [*settings, f"waveform.duration_s={seconds}"])
         for name, settings, seconds in RUNS
@@ -77,7 +77,7 @@ np.save(path.with_suffix(".npy"), np.array([each for each in columns.values() if
 """
 
 
-def test_a_run_is_the_same_where_numba_is_told_not_to_compile(tmp_path):
+def test_run_without_compilation_is_the_same(tmp_path):
     found = []
     for name, told in (("compiled", {}), ("plain", {"NUMBA_DISABLE_JIT": "1"})):
         path = tmp_path / f"{name}.mcap"

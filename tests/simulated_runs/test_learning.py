@@ -60,7 +60,7 @@ def test_full_stroke_is_learned_to_the_noise(tmp_path, frequency_hz):
 
 
 @pytest.mark.parametrize(("load_kg", "frequency_hz"), [(9.2, 100.0)])
-def test_a_load_that_the_model_knows_nothing_of_is_learned(tmp_path, load_kg, frequency_hz):
+def test_unmodelled_load_is_learned(tmp_path, load_kg, frequency_hz):
     """The resonance falls to 302 Hz; it is found, and the error goes as far down."""
     learned = learn(tmp_path, at(frequency_hz, f"device.load_kg={load_kg}"))
     natural_hz = np.sqrt(33.597e6 / (0.162 + load_kg)) / (2.0 * np.pi)
@@ -103,7 +103,7 @@ def test_the_delay_of_a_link_is_found(tmp_path):
     assert behind.check[0].error_percent <= 0.15
 
 
-def test_what_is_too_fast_is_learned_more_slowly(tmp_path):
+def test_excessive_bandwidth_is_reduced(tmp_path):
     """A correction that would break a limit is not run; smaller steps are."""
     slow = IlcSession(SINE, at(250.0, "limits.slew_a_per_s=14700.0"), tmp_path, unpaced)
     learned = slow.learn(8, lambda rows: None)
@@ -192,7 +192,7 @@ def test_learning_goes_on_from_a_correction(tmp_path):
     assert errors(second)[0] == pytest.approx(errors(first)[4], rel=0.3)
 
 
-def test_what_can_not_be_learned_is_refused_before_anything_moves(tmp_path):
+def test_impossible_learning_is_refused_in_advance(tmp_path):
     plain = CliRunner().invoke(
         app, ["learn", str(CONFIGS / "terfenol_sine_6a_uncompensated.yaml"), "--output", "c.yaml"]
     )

@@ -58,7 +58,7 @@ def test_a_simulated_rig_is_compensated_by_default(tmp_path, device, settings, p
 
 @pytest.mark.long
 @pytest.mark.parametrize(("device", "settings", "percent"), MORE_RIGS.values(), ids=MORE_RIGS)
-def test_so_are_the_others(tmp_path, other_rigs, device, settings, percent):
+def test_other_rigs_are_compensated_by_default(tmp_path, other_rigs, device, settings, percent):
     follow(tmp_path, device, (*settings, *QUICK), percent)
 
 
@@ -73,7 +73,7 @@ PATIENT = (
 
 @pytest.mark.long
 @pytest.mark.timeout(900)
-def test_so_is_an_emulated_board(tmp_path):
+def test_emulated_board_is_compensated_by_default(tmp_path):
     with emulated(Wire("cobs_board_fifo", BOARD, 10_000.0), tmp_path) as device:
         at = f"device.serial_port={device['serial_port']}"
         follow(tmp_path, "cobs_board_fifo", (at, *PATIENT), 1.2, fast=False)

@@ -42,7 +42,7 @@ def states_of(entries):
 OTHER = GOLDEN / f"{NAMES[0]}.mcap"
 
 
-def test_what_can_not_be_read_is_listed_and_listed(folder):
+def test_unreadable_files_are_listed_each_time(folder):
     whole = OTHER.read_bytes()
     torn = folder / "torn.mcap"
     torn.write_bytes(whole[:-100])
@@ -119,7 +119,7 @@ def test_a_condition_is_a_condition_in_sql(where):
 
 
 @pytest.mark.parametrize("where", ['reason == "x"', 'reason != "x"', "label.other > 3"])
-def test_what_is_unknown_meets_neither_a_condition_nor_its_opposite(where):
+def test_unknown_values_meet_no_condition(where):
     assert select([ONE], where) == []
     assert select([ONE], f"not ({where})") == []
 
@@ -140,7 +140,7 @@ def test_what_is_unknown_meets_neither_a_condition_nor_its_opposite(where):
     "load_extension('x')",
     "1) UNION SELECT * FROM recordings",
 ])  # fmt: skip
-def test_any_other_condition_is_an_input_error_with_the_keys(where):
+def test_invalid_condition_is_an_input_error_with_the_keys(where):
     keys = r"frequency_hz, .*label\.sample, .*waveform\.window"
     with pytest.raises(InputError, match=keys) as error:
         select([ONE], where)
@@ -246,13 +246,13 @@ def test_a_recording_agrees_with_its_report():
     ({LABELS_FACT: "3"}, "metadata hilctl.run: labels must be texts and numbers by name"),
     ({"segments": "[{}]"}, "metadata hilctl.run: segments: 0.label: is required"),
 ])  # fmt: skip
-def test_a_recording_that_nobody_can_read_says_why(tmp_path, change, problem):
+def test_invalid_recording_has_its_problem(tmp_path, change, problem):
     found = made_entry(tmp_path, {**RUN, **change}, END)
     assert found["state"] == "unreadable"
     assert found["problem"].startswith(problem)
 
 
-def test_what_is_no_recording_has_its_place_and_its_problem(tmp_path):
+def test_other_file_has_its_path_and_problem(tmp_path):
     (tmp_path / "a").write_text("hello")
     found = entry_of(tmp_path / "a", "a.mcap", 5, 6)
     assert found == unreadable("a.mcap", 5, 6, found["problem"])

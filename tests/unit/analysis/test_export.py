@@ -111,7 +111,7 @@ READERS = {".csv": read_csv, ".npz": read_npz, ".parquet": read_parquet, ".mat":
 @pytest.mark.parametrize("suffix", READERS)
 @pytest.mark.parametrize("unit", ["A", "V"])
 @pytest.mark.parametrize("measured", [True, False])
-def test_every_column_comes_back_bit_for_bit(
+def test_every_column_is_exported_bit_for_bit(
     tmp_path: Path, suffix: str, unit: str, measured: bool
 ) -> None:
     run = recording(unit, measured=measured)
@@ -250,7 +250,7 @@ def test_one_query_sees_every_sample_of_every_run(folder, tmp_path):
         assert b"hilctl.experiment_yaml" in table.schema.metadata
 
 
-def test_a_second_call_goes_on_and_touches_nothing(folder, tmp_path):
+def test_second_export_keeps_existing_files(folder, tmp_path):
     output = tmp_path / "out"
     exported(folder, output)
     before = files(output)
@@ -262,7 +262,7 @@ def test_a_second_call_goes_on_and_touches_nothing(folder, tmp_path):
     assert all(after[path] == before[path] for path in before if path != gone)
 
 
-def test_what_can_not_be_exported_is_said_and_the_rest_goes_on(folder, tmp_path):
+def test_files_that_cannot_be_exported_are_reported(folder, tmp_path):
     whole = (GOLDEN / "piezo_compensated.mcap").read_bytes()
     (folder / "cut.mcap").write_bytes(whole[:-100])
     (folder / "text.mcap").write_text("hello")
@@ -279,7 +279,7 @@ def test_what_can_not_be_exported_is_said_and_the_rest_goes_on(folder, tmp_path)
     assert "piezo_compensated.mcap" in left_out["twice/piezo_compensated.mcap"]
 
 
-def test_a_disk_that_refuses_leaves_nothing_half_written(folder, tmp_path, monkeypatch):
+def test_full_disk_leaves_no_partial_file(folder, tmp_path, monkeypatch):
     def full(file, facts):
         file._stream.write(b"PAR1")
         raise OSError(28, "No space left on device")
@@ -309,7 +309,7 @@ def test_names_from_files_stay_within_the_output(name, started, path, place):
     assert str(place_of(entry)) == place
 
 
-def test_no_name_is_longer_than_a_file_system_takes():
+def test_names_fit_the_file_system():
     long = "\N{GRINNING FACE}" * 100
     entry = unreadable(f"{long}.mcap", 1, 2, "") | {"name": long, "run_id": "\0" * 50}
     assert max(len(part.encode()) for part in place_of(entry).parts) <= 255

@@ -76,7 +76,7 @@ class Full(io.BytesIO):
 
 
 @pytest.mark.parametrize("size", [1, 2**21])
-def test_parquet_that_is_refused_is_refused_once(monkeypatch, capfd, size):
+def test_parquet_error_is_raised_once(monkeypatch, capfd, size):
     monkeypatch.setattr(export_files, "_WRITTEN_BYTES", size)
 
     def refused():
@@ -90,7 +90,7 @@ def test_parquet_that_is_refused_is_refused_once(monkeypatch, capfd, size):
     assert capfd.readouterr() == ("", "")
 
 
-def test_parquet_that_is_given_up_leaves_its_stream_alone(capfd):
+def test_abandoned_parquet_file_does_not_write(capfd):
     stream = io.BytesIO()
     file = ParquetFile(stream)
     file.add(PARTS[0])
@@ -99,7 +99,7 @@ def test_parquet_that_is_given_up_leaves_its_stream_alone(capfd):
     assert capfd.readouterr() == ("", "")
 
 
-def test_only_columns_that_can_have_nulls_say_so(tmp_path):
+def test_only_columns_with_nulls_are_nullable(tmp_path):
     """Arrow's, which readers of a folder of files want alike, and those of any Python object."""
     given = {**WHOLE, "b": pa.array([None] * 30_001, pa.float64()), "c": ["x", None, "y"] * 10_000}
     given["c"] += ["z"]

@@ -36,7 +36,7 @@ def damaged(tmp_path):
     return path
 
 
-def test_replay_leaves_out_what_stands_behind_lost_samples(damaged):
+def test_replay_omits_samples_after_a_gap(damaged):
     """After a damaged chunk the compensator's memory is not known; what is before it replays."""
     for recording in (read(damaged), read(recover_recording(damaged).path)):
         result = replay(recording)
@@ -45,7 +45,7 @@ def test_replay_leaves_out_what_stands_behind_lost_samples(damaged):
         assert result.samples + result.left_out_samples == recording.samples.index.size
 
 
-def test_the_sound_recording_is_identical_and_another_model_is_not(recording):
+def test_replay_is_identical_except_with_another_model(recording):
     same = replay(recording)
     assert (same.identical, same.first_difference, same.differing_samples) == (True, None, 0)
     assert same.samples == recording.samples.index.size
@@ -77,7 +77,7 @@ def test_one_flipped_bit_is_found_at_its_sample():
     assert (found.first_difference, found.differing_samples) == (int(samples.index[1234]), 1)
 
 
-def test_what_can_not_be_replayed_is_refused():
+def test_recording_without_a_compensator_is_refused():
     recording = read(GOLDEN / "terfenol_uncompensated.mcap")
     with pytest.raises(DataError, match="no compensator"):
         replay(recording, OTHER)
@@ -85,7 +85,7 @@ def test_what_can_not_be_replayed_is_refused():
         replay(replace(recording, starts=()))
 
 
-def test_what_no_compensator_has_left_is_refused(recording):
+def test_impossible_states_are_refused(recording):
     """States, commands and rates come from the file, and kernels work with them."""
     start = recording.starts[0]
     for state in (start.state[:-1], np.full_like(start.state, np.inf)):
@@ -158,7 +158,7 @@ def test_a_damaged_file_in_pieces(damaged, monkeypatch):
     assert replay(RecordingStream(damaged)) == whole
 
 
-def test_samples_without_the_inverse_need_the_event_that_says_so():
+def test_bypassed_samples_need_their_event():
     recording = read(GOLDEN / "terfenol_compensated.mcap")
     recording.samples.flags[500:600] |= np.uint32(Flag.INVERSE_OUT)
     with pytest.raises(DataError, match="/events: "):
@@ -172,7 +172,7 @@ def predicted(model, rate_hz, *pieces):
     return prediction.result()
 
 
-def test_a_model_that_is_the_actuator_would_leave_nothing(recording):
+def test_exact_model_predicts_no_error(recording):
     samples, rate_hz = recording.samples, recording.sample_rate_hz
     actuator = replace(samples, displacement_um=OTHER.forward(rate_hz).process(samples.command))
     found = predicted(OTHER, rate_hz, actuator)
@@ -180,7 +180,7 @@ def test_a_model_that_is_the_actuator_would_leave_nothing(recording):
     assert found.recorded_peak_percent > 1.0
 
 
-def test_the_model_of_the_run_would_have_what_was_recorded(recording):
+def test_model_of_the_run_predicts_the_recorded_error(recording):
     """But for what its inverse, where the rate is in it, is not exact by: about a tenth here."""
     model = parse_model("model.yaml", recording.model_yaml)
     found = predicted(model, recording.sample_rate_hz, recording.samples)

@@ -72,7 +72,7 @@ def check_loop(report: RunReport) -> None:
 class TestSteadyPeriodicRun:
     @pytest.mark.parametrize("period", [50_000.0, 200.0, 1000.0 / 3.0])
     @pytest.mark.parametrize("cycles", [1, 3])
-    def test_figures_are_those_of_the_closed_form(self, lagging, period, cycles) -> None:
+    def test_metrics_are_those_of_the_closed_form(self, lagging, period, cycles) -> None:
         """1, 250 and 150 Hz at 50 kHz, one cycle or several, give the same figures."""
         report = summarize(lagging(period, cycles))
         check_loop(report)
@@ -124,7 +124,7 @@ class TestSteadyPeriodicRun:
         assert report.peak_hysteresis_percent is report.peak_to_peak_um is None
         assert report.peak_error_percent is None
 
-    def test_readings_that_were_not_trusted_are_not_judged(self, lagging) -> None:
+    def test_invalid_readings_are_not_evaluated(self, lagging) -> None:
         recording = lagging()
         recording.samples.displacement_um[2500] = np.nan
         recording.samples.displacement_um[2600] = 1e6
@@ -168,7 +168,7 @@ class TestSteadyPeriodicRun:
         assert report.zero_um == 1.25
         assert dict(run_rows(report))["sensor zero"].startswith("1.250 µm")
 
-    def test_period_too_short_tells_no_noise(self, lagging) -> None:
+    def test_short_period_has_no_noise_estimate(self, lagging) -> None:
         """With 12 samples a period, signal can't be told from noise."""
         report = summarize(lagging(period=12.0, cycles=100))
         assert report.sensor_noise_um is None
@@ -217,7 +217,7 @@ class TestWithoutAPeriod:
 
 
 class TestCutShort:
-    def test_judges_the_whole_cycles_it_got_to(self, lagging) -> None:
+    def test_complete_cycles_are_evaluated(self, lagging) -> None:
         recording = lagging(cycles=6)
         recording = replace(recording, samples=recording.samples.part(0, 3700), end={})
         report = summarize(recording)
@@ -226,7 +226,7 @@ class TestCutShort:
         assert not report.complete
         assert "cut short" in report.reason
 
-    def test_ramp_ends_what_is_judged(self, lagging) -> None:
+    def test_ramp_is_not_evaluated(self, lagging) -> None:
         recording = lagging(cycles=6, end={"reason": "stopped"})
         samples = recording.samples
         samples.flags[3700:] |= Flag.RAMP.value
@@ -247,7 +247,7 @@ class TestCutShort:
         assert missed.peak_hysteresis_percent is None
         assert (missed.samples, missed.steady_samples) == (0, 0)
 
-    def test_nothing_recorded_is_reported_as_that(self, lagging) -> None:
+    def test_empty_recording_has_a_report(self, lagging) -> None:
         recording = lagging(ticks=Ticks(*(np.empty(0, dtype=np.int64),) * 4))
         report = summarize(replace(recording, samples=recording.samples.part(0, 0), end={}))
         assert report.recorded_samples == 0
@@ -288,7 +288,7 @@ class TestWholeRun:
         assert report.steady_samples == 6000
         assert second.start_s == pytest.approx(4000 / RATE_HZ)
 
-    def test_floor_belongs_to_the_hysteresis_beside_it(self, make_recording) -> None:
+    def test_noise_floor_is_that_of_the_worst_segment(self, make_recording) -> None:
         """A noisier segment with less hysteresis does not lend its floor; noise is pooled."""
         rng = np.random.default_rng(8)
         reference_um = np.concatenate((wave(1000.0, 9), 0.1 * wave(1000.0, 3)))
@@ -432,7 +432,7 @@ def with_end(end):
 
 
 @pytest.mark.parametrize("loop", [LOOP, None])
-def test_what_a_run_wrote_is_read(loop):
+def test_usage_of_processes_is_read(loop):
     known = {"loop": loop} if loop else {}
     assert processes_of(with_end(usage_facts(loop, SUPERVISOR))) == {
         **known,
@@ -447,12 +447,12 @@ def test_what_a_run_wrote_is_read(loop):
     usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "-1"),
     usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "1" + "0" * 400),
 ])  # fmt: skip
-def test_what_is_damaged_is_refused_with_its_place(text):
+def test_damaged_usage_is_refused_with_its_place(text):
     with pytest.raises(DataError, match="processes: "):
         processes_of(with_end({USAGE_FACT: text}))
 
 
-def test_a_number_with_a_point_that_is_whole_is_one():
+def test_whole_float_is_a_whole_number():
     """Other programs may write it so."""
     text = usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "98000000.0")
     assert processes_of(with_end({USAGE_FACT: text}))["loop"] == LOOP

@@ -16,7 +16,7 @@ GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_compens
 
 
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_becomes_null(value):
+def test_nonfinite_metrics_are_null(value):
     report = summarize(read(GOLDEN))
     first = replace(report.segments[0], peak_error_percent=value)
     broken = replace(
@@ -56,7 +56,7 @@ def test_uncompensated_runs_have_no_errors(report):
     assert not any("error" in name for name, _ in quality_rows(plain))
 
 
-def test_columns_that_are_empty_everywhere_are_left_out(report):
+def test_empty_columns_are_omitted(report):
     segment = report.segments[0]
     blank = replace(segment, frequency_hz=None)
     headings, rows = segment_table(replace(report, segments=(segment, blank)))
@@ -67,7 +67,7 @@ def test_columns_that_are_empty_everywhere_are_left_out(report):
     assert len(rows[0]) == len(headings)
 
 
-def test_people_read_megabytes_and_seconds():
+def test_usage_is_shown_in_megabytes_and_seconds():
     text = usage_text(ProcessUsage(98_000_000, 1_500_000_000, 12, 3, 1234))
     for part in ("98 MB", "1.50 s", "15 ", "3 from", "1,234 "):
         assert part in text

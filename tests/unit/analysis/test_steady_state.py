@@ -49,7 +49,7 @@ def run(make_recording):
     return make
 
 
-def test_only_what_lies_behind_the_last_change_is_judged(run):
+def test_samples_after_the_last_change_are_evaluated(run):
     recording = run(tuned(510, 0.3, 250), tuned(900, 0.5, 130))
     part = steady_part(recording, recording.segments[0])
     assert part.samples.index[0] == 1200  # of 9 whole cycles from 1030 on, one is left out
@@ -59,21 +59,21 @@ def test_only_what_lies_behind_the_last_change_is_judged(run):
     assert summarize(recording).peak_to_peak_um == pytest.approx(10.0, rel=1e-3)
 
 
-def test_change_that_goes_on_to_the_end_leaves_nothing_to_judge(run):
+def test_change_until_the_end_leaves_nothing_to_evaluate(run):
     recording = run(tuned(300, 0.3, 10 * SAMPLES))
     part = steady_part(recording, recording.segments[0])
     assert (part.samples.index.size, part.cycles, part.cycle) == (0, 0, None)
     assert summarize(recording).peak_hysteresis_percent is None
 
 
-def test_change_of_unknown_length_leaves_nothing_to_judge(run):
+def test_change_of_unknown_length_leaves_nothing_to_evaluate(run):
     """A recording of an older version has the length in the event's text only."""
     event, change = tuned(300, 0.3, 100)
     recording = run((replace(event, values={}), change))
     assert steady_part(recording, recording.segments[0]).cycles == 0
 
 
-def test_segments_before_a_change_are_judged_as_ever(run):
+def test_segments_before_a_change_are_evaluated(run):
     half = SAMPLES // 2
     first = Segment("first", 0, half, 0, half, PERIOD)
     second = first.shifted(half)

@@ -28,7 +28,7 @@ def test_percentiles_are_in_microseconds() -> None:
     assert tick_lateness.percentiles_us(lateness(ticks([])).late_ns) == {}
 
 
-def test_minutes_are_told_apart() -> None:
+def test_minutes_are_evaluated_separately() -> None:
     run = ticks([1_000] * 60 + [2_000] * 60 + [5_000] * 10, period_ns=1_000_000_000)
     run.deadline_ns[120:] += 60_000_000_000
     found = lateness(run).by_minute()
@@ -37,7 +37,7 @@ def test_minutes_are_told_apart() -> None:
     assert lateness(ticks([])).by_minute() == []
 
 
-def test_long_runs_are_told_in_longer_stretches() -> None:
+def test_long_runs_have_longer_intervals() -> None:
     deadline_ns = np.arange(500_000, dtype=np.int64) * 60_000_000_000
     zeros = np.zeros_like(deadline_ns)
     rows = lateness(Ticks(zeros, deadline_ns, zeros, zeros), 500_000.0).by_minute()

@@ -8,12 +8,12 @@ import pytest
 from hilctl.base.alarm import alarm, time_limit
 
 
-def test_code_beyond_the_limit_is_left():
+def test_code_that_exceeds_the_limit_is_interrupted():
     with pytest.raises(TimeoutError), time_limit():
         signal.raise_signal(signal.SIGALRM)
 
 
-def test_handler_and_timer_are_those_before():
+def test_handler_and_timer_are_restored():
     before = signal.getsignal(signal.SIGALRM)
     timer_s, interval_s = signal.getitimer(signal.ITIMER_REAL)
     calls = []
@@ -26,7 +26,7 @@ def test_handler_and_timer_are_those_before():
     assert (0.0 < left_s <= timer_s) or (left_s, timer_s) == (0.0, 0.0)
 
 
-def test_another_thread_is_left_alone():
+def test_other_threads_are_not_interrupted():
     found = []
 
     def work():

@@ -30,7 +30,7 @@ def test_all_problems_of_a_file_are_one_error():
     assert error.problems == tuple(problems)
 
 
-def test_what_the_user_gave_is_told_from_what_happened():
+def test_input_errors_and_run_errors_are_separate():
     """Exit codes are by these two: bad input ends with 2, a run that failed with 3."""
     found = {c for c in vars(errors).values() if isinstance(c, type) and issubclass(c, Exception)}
     assert all(issubclass(each, HilctlError) for each in found)

@@ -34,7 +34,7 @@ def test_file_is_read_once(tmp_path):
     assert files.read(path) == "first"
 
 
-def test_given_texts_stand_for_the_disk(tmp_path, monkeypatch):
+def test_given_texts_replace_the_files(tmp_path, monkeypatch):
     path = tmp_path / "model.yaml"
     path.write_text("first")
     monkeypatch.chdir(tmp_path)
@@ -44,7 +44,7 @@ def test_given_texts_stand_for_the_disk(tmp_path, monkeypatch):
     assert TextFiles(files.texts).read(path) == "first"
 
 
-def test_nothing_else_is_read_where_texts_are_given(tmp_path):
+def test_files_without_a_given_text_are_refused(tmp_path):
     path = tmp_path / "other.yaml"
     path.write_text("text")
     with pytest.raises(InputError, match=r"other\.yaml"):
@@ -56,7 +56,7 @@ def test_nothing_else_is_read_where_texts_are_given(tmp_path):
     (lambda path: path.mkdir(), "is not a file"),
     (lambda path: path.write_bytes(b"\xff\xfe\x00"), "is not UTF-8 text"),
 ])  # fmt: skip
-def test_unreadable_files_are_told(tmp_path, make, message):
+def test_unreadable_files_are_refused(tmp_path, make, message):
     path = tmp_path / "thing"
     make(path)
     with pytest.raises(InputError, match=f"thing: {message}"):
@@ -98,12 +98,12 @@ class TestWriting:
         assert link.is_symlink()
         assert sorted(tmp_path.iterdir()) == [link, path]
 
-    def test_a_folder_is_no_file_to_overwrite(self, tmp_path):
+    def test_folder_is_not_overwritten(self, tmp_path):
         with pytest.raises(InputError, match="is a folder"):
             write_text(tmp_path, "new", overwrite=False)
 
     @pytest.mark.parametrize("links", [True, False])
-    def test_a_file_made_meanwhile_is_kept(self, tmp_path, monkeypatch, links):
+    def test_file_created_meanwhile_is_kept(self, tmp_path, monkeypatch, links):
         path = tmp_path / "out.txt"
         if not links:
             monkeypatch.setattr(Path, "hardlink_to", _refuse)
@@ -130,7 +130,7 @@ class TestWriting:
     @pytest.mark.parametrize(
         "error", [OSError(28, "No space left on device"), KeyboardInterrupt(), ValueError()]
     )
-    def test_what_breaks_off_leaves_nothing(self, tmp_path, overwrite, error):
+    def test_interrupted_write_leaves_nothing(self, tmp_path, overwrite, error):
         path = tmp_path / "out.txt"
         if overwrite:
             path.write_text("precious")
@@ -149,7 +149,7 @@ class TestWriting:
         left = [each.read_text() for each in tmp_path.iterdir()]
         assert left == (["precious"] if overwrite else [])
 
-    def test_a_disk_that_fails_at_the_end(self, tmp_path, monkeypatch):
+    def test_failed_sync_leaves_nothing(self, tmp_path, monkeypatch):
         monkeypatch.setattr(os, "fsync", _refuse)
         with pytest.raises(
             InputError, match=r"out\.txt: can't be written: Operation not permitted"
@@ -157,14 +157,14 @@ class TestWriting:
             write_text(tmp_path / "out.txt", "text", overwrite=False)
         assert list(tmp_path.iterdir()) == []
 
-    def test_a_folder_that_can_not_be_brought_to_the_disk(self, tmp_path, monkeypatch):
+    def test_folder_that_cannot_be_synced_is_an_error(self, tmp_path, monkeypatch):
         for number in (errno.EINVAL, errno.EIO):
             monkeypatch.setattr(os, "fsync", partial(_refuse_by, number))
             refused = pytest.raises(OSError, match="Input/output")
             with refused if number == errno.EIO else nullcontext():
                 sync_folder(tmp_path)
 
-    def test_what_is_no_regular_file_is_not_replaced(self, tmp_path):
+    def test_special_files_are_not_replaced(self, tmp_path):
         os.mkfifo(tmp_path / "pipe")
         for path in (tmp_path, tmp_path / "pipe"):
             with pytest.raises(InputError, match="can't be written: Not a regular file"):
@@ -177,7 +177,7 @@ class TestWriting:
          ("x" * 300, "File name too long")],
     )  # fmt: skip
     @pytest.mark.parametrize("overwrite", [True, False])
-    def test_places_that_can_not_be_written(self, tmp_path, name, reason, overwrite):
+    def test_unwritable_places_are_refused(self, tmp_path, name, reason, overwrite):
         (tmp_path / "plain").touch()
         with pytest.raises(InputError, match=f"can't be written: {reason}") as caught:
             write_text(tmp_path / name, "text", overwrite=overwrite)
@@ -197,7 +197,7 @@ def _refuse(*_arguments):
 
 
 @pytest.mark.parametrize("name", ["folder", "fifo", "null", "missing/out.txt", "x" * 300])
-def test_what_could_not_be_written_is_refused_beforehand(tmp_path, name):
+def test_unwritable_output_is_refused_in_advance(tmp_path, name):
     (tmp_path / "folder").mkdir()
     os.mkfifo(tmp_path / "fifo")
     (tmp_path / "null").symlink_to("/dev/null")
@@ -211,7 +211,7 @@ def test_what_could_not_be_written_is_refused_beforehand(tmp_path, name):
     assert sorted(tmp_path.iterdir()) == before
 
 
-def test_what_can_be_written_is_left_as_it_is(tmp_path):
+def test_writable_output_is_not_touched(tmp_path):
     (tmp_path / "old.txt").write_text("old")
     check_writable(tmp_path / "old.txt", overwrite=True)
     check_writable(tmp_path / "new.txt", overwrite=False)
@@ -219,18 +219,18 @@ def test_what_can_be_written_is_left_as_it_is(tmp_path):
 
 
 @pytest.mark.parametrize("remedies", [REMEDIES, ADDRESS_REMEDIES, CONNECT_REMEDIES, PORT_REMEDIES])
-def test_the_systems_words_come_first(remedies):
+def test_reason_begins_with_the_text_of_the_system(remedies):
     for code, remedy in remedies.items():
         for error in (OSError(code, os.strerror(code)), OSError(code, "words of a library")):
             assert reason(error, remedies) == f"{os.strerror(code)} ({remedy})"
 
 
-def test_what_is_not_known_is_said_as_it_is():
+def test_unknown_error_is_its_text():
     assert reason(OSError(errno.EIO, "Input/output error")) == "Input/output error"
     assert reason(TimeoutError("timed out")) == "timed out"
 
 
-def test_the_file_that_is_likely_to_be_meant(tmp_path):
+def test_similar_file_is_suggested(tmp_path):
     (tmp_path / "terfenol_sine_6a.yaml").touch()
     meant = no_such_file(tmp_path / "terfenol_sine.yaml")
     assert meant.endswith(

@@ -25,11 +25,11 @@ from hilctl.base import formatting
     (1.5e-12, "um", "1.50e-09 nm"),
     (None, "um", "-"),
 ])  # fmt: skip
-def test_a_quantity_is_read_without_counting_zeros(value, unit, text):
+def test_quantities_have_readable_prefixes(value, unit, text):
     assert formatting.quantity(value, unit) == text
 
 
-def test_digits_are_the_same_whatever_the_size():
+def test_number_of_digits_does_not_depend_on_the_size():
     assert [formatting.significant(v) for v in (0.012345, 1.0, 9.996, 12345.0, 1e7, 1e-6)] == [
         "0.0123", "1.00", "10.0", "12300", "1.00e+07", "1.00e-06",
     ]  # fmt: skip
@@ -49,11 +49,11 @@ def test_units_have_their_signs():
     ("\u202egnp.exe", "\\u202egnp.exe"),
     ("\x9b2Jc\rd\x7fe", "\\x9b2Jc\\rd\\x7fe"),
 ])  # fmt: skip
-def test_what_steers_a_terminal_is_written_out(text: str, shown: str) -> None:
+def test_control_characters_are_escaped(text: str, shown: str) -> None:
     assert formatting.printable(text) == shown
 
 
-def test_lines_stay_where_they_are_wanted() -> None:
+def test_line_breaks_are_kept_on_request() -> None:
     assert formatting.printable("a:\n\tb\r", lines=True) == "a:\n\tb\\r"
 
 
@@ -77,7 +77,7 @@ def test_finite_values_stay_as_they_are(indent: int | None) -> None:
 
 
 @pytest.mark.parametrize("bad", [math.nan, math.inf, -math.inf])
-def test_what_is_not_finite_is_null(bad: float) -> None:
+def test_nonfinite_values_are_null(bad: float) -> None:
     text = formatting.finite_json({"x": bad, "y": [bad, 1.0], "z": {"deep": (bad, "inf")}})
     found = json.loads(text, parse_constant=refuse)
     assert found == {"x": None, "y": [None, 1.0], "z": {"deep": [None, "inf"]}}
@@ -119,7 +119,7 @@ KEYS = ("amplifier", "host", "parity", "sample_rate_hz", "serial_port", "tcp_por
         ("s", []),
     ],
 )
-def test_only_plausible_names_are_offered_otherwise_all(word, offered):
+def test_similar_names_are_suggested_otherwise_all(word, offered):
     hint = formatting.did_you_mean(word, KEYS)
     assert [key for key in KEYS if key in hint] == (offered or list(KEYS))
     assert bool(formatting.did_you_mean(word, KEYS, listed=True)) == bool(offered)

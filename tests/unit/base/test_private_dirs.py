@@ -14,7 +14,7 @@ from hilctl.base.private_dirs import (
 )
 
 
-def test_made_for_its_user_alone(tmp_path):
+def test_folder_is_private(tmp_path):
     before = os.umask(0)
     try:
         made = private_folder(tmp_path / "own")
@@ -24,7 +24,7 @@ def test_made_for_its_user_alone(tmp_path):
     assert private_folder(tmp_path / "own") == made
 
 
-def test_not_made_where_it_is_only_looked_for(tmp_path):
+def test_folder_is_not_created_by_a_lookup(tmp_path):
     with pytest.raises(FileNotFoundError):
         private_folder(tmp_path / "own", make=False)
     assert not list(tmp_path.iterdir())
@@ -54,7 +54,7 @@ def test_writable_by_others_is_refused(tmp_path, mode):
         private_folder(tmp_path / "own")
 
 
-def test_of_somebody_else_is_refused(tmp_path, monkeypatch):
+def test_folder_of_another_user_is_refused(tmp_path, monkeypatch):
     (tmp_path / "own").mkdir(mode=0o700)
     owner = os.geteuid()
     monkeypatch.setattr(os, "geteuid", lambda: owner + 1)
@@ -62,7 +62,7 @@ def test_of_somebody_else_is_refused(tmp_path, monkeypatch):
         private_folder(tmp_path / "own")
 
 
-def test_each_user_has_places_of_their_own(monkeypatch):
+def test_each_user_has_separate_folders(monkeypatch):
     monkeypatch.setattr(os, "geteuid", lambda: 1234)
     assert user_folders()[0] == memory_folder() / "hilctl-1234"
     assert str(user_folders()[1]) == "/run/user/1234/hilctl"
@@ -76,7 +76,7 @@ def two(tmp_path):
         yield one, other
 
 
-def test_one_at_a_time(two):
+def test_exclusive_lock_has_one_holder(two):
     one, other = two
     assert not is_locked(other)
     take_lock(one)
@@ -87,14 +87,14 @@ def test_one_at_a_time(two):
     take_lock(other)
 
 
-def test_two_may_share(two):
+def test_shared_lock_has_two_holders(two):
     one, other = two
     take_lock(one, shared=True)
     take_lock(other, shared=True)
     assert not is_locked(two[0])
 
 
-def test_without_locks_nobody_is_kept_out(two, monkeypatch):
+def test_file_system_without_locks_is_no_error(two, monkeypatch):
     monkeypatch.setattr(locks, "fcntl", None)
     for each in two:
         take_lock(each)

@@ -28,7 +28,7 @@ def same(found: Samples, expected: Samples) -> bool:
     )
 
 
-def test_no_field_and_no_number_stands_for_two_columns() -> None:
+def test_fields_and_numbers_of_columns_are_unique() -> None:
     assert len({each.name for each in RECORDED_FIELDS}) == len(RECORDED_FIELDS)
     for message in ("block", "before", "scope"):
         numbers = [number for each in RECORDED_FIELDS if (number := getattr(each, message))]

@@ -61,5 +61,5 @@ def test_mapping_goes_through_json() -> None:
     ("label", "loop"),
     [("sine 6 A 10 Hz", True), ("file step.csv", True), ("step", False), ("hold 2 A", False)],
 )
-def test_steps_and_sums_of_many_sines_are_no_loops(label, loop):
+def test_steps_and_multisines_are_no_loops(label, loop):
     assert Segment(label, 0, 100, 0, 100, 10.0).is_loop == loop

@@ -20,7 +20,7 @@ class Gain(StrictModel):
     {"gain": 1.0, "gian": 1.0},
     {},
 ])  # fmt: skip
-def test_what_is_not_exactly_right_is_refused(given):
+def test_values_of_other_types_are_refused(given):
     with pytest.raises(ValidationError):
         Gain.model_validate(given)
 

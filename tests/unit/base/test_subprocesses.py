@@ -42,7 +42,7 @@ def test_environment_is_restored(monkeypatch, before):
     assert os.environ.get("PYTHONSAFEPATH") == before
 
 
-def test_every_child_is_started_this_way():
+def test_every_subprocess_is_started_by_python_command():
     own = ROOT / "hilctl" / "base" / "subprocesses.py"
     files = [each for folder in ("hilctl", "drivers") for each in (ROOT / folder).rglob("*.py")]
     texts = {each: each.read_text(encoding="utf-8") for each in files if each != own}

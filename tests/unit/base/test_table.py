@@ -37,7 +37,7 @@ def test_columns(tmp_path: Path) -> None:
         assert refusal(table.index, column) == text
 
 
-def test_column_that_nobody_named(tmp_path: Path) -> None:
+def test_unnamed_columns_have_numbers(tmp_path: Path) -> None:
     path = tmp_path / "t.csv"
     assert Names(path, ["x"]).index(None) == 0
     text = "t.csv: has several columns: set column to one of x, y"
@@ -85,7 +85,7 @@ def test_units_have_factors():
 
 
 @pytest.mark.parametrize("suffix", [".npz", ".mat", ".parquet", ".npy"])
-def test_arrays_of_other_programs(tmp_path, suffix):
+def test_files_of_numpy_matlab_and_arrow_are_read(tmp_path, suffix):
     t, v, y = np.arange(50) / 100.0, np.arange(50) % 7, -2.5 * np.arange(50)
     path = tmp_path / f"loops{suffix}"
     if suffix == ".npz":
@@ -173,7 +173,7 @@ def test_names(table, text: str, names: list[str]) -> None:
     ("1,2\n" + "x" * 200_000 + ",1\n3,4\n",
      f"t.csv:2: must have 2 columns, as the others have, got 0: '{'x' * 57}...'"),
 ])  # fmt: skip
-def test_mistakes_have_their_line(table, text: str, message: str) -> None:
+def test_errors_have_their_line(table, text: str, message: str) -> None:
     assert refusal(table(text).read, [0]) == message
 
 
@@ -183,7 +183,7 @@ def test_nothing(table, text: str) -> None:
     assert refusal(table, text).startswith("t.csv: holds no rows")
 
 
-def test_what_is_not_asked_for_may_be_anything(table) -> None:
+def test_columns_that_are_not_read_may_contain_text(table) -> None:
     made = table("t,label\n1,up\n2,down\n3,\nthe end\n4,up\n")
     found = made.read([0], 1, 3)
     np.testing.assert_array_equal(found.values, [[1.0, 2.0, 3.0]])
@@ -212,14 +212,14 @@ def test_a_table_too_large_is_not_read(table, monkeypatch: pytest.MonkeyPatch) -
         table(b"\xff" * 2_000_000)
 
 
-def test_lines_that_are_no_row_are_refused_at_once(tmp_path):
+def test_too_many_columns_are_refused(tmp_path):
     path = tmp_path / "wide.csv"
     path.write_text("1," * 5000 + "\n1\n")
     with pytest.raises(DataError, match="1000 columns"):
         TextTable(path)
 
 
-def test_comments_without_end_are_no_header(tmp_path):
+def test_long_comments_are_no_header(tmp_path):
     path = tmp_path / "long.csv"
     path.write_text("#" + "a" * 200_000 + "\n# b\n1\n2\n")
     assert TextTable(path).names == ["b"]

@@ -213,7 +213,7 @@ def test_duplicate_keys_are_all_named():
     ('a: 1\nb: "\\U7fffffff"\n', "bench.yaml:2: is not readable YAML (an escape names"),
     ("a: 1\nb: 2\nc: \x07\n", "bench.yaml:3: is not readable YAML (the character U+0007 is not"),
 ])  # fmt: skip
-def test_what_is_not_plain_yaml_is_refused(text, message):
+def test_other_than_plain_yaml_is_refused(text, message):
     assert refusal(document, text).startswith(message)
 
 
@@ -348,14 +348,14 @@ TREE = {
 }
 
 
-def test_read_back_it_is_the_same():
+def test_commented_text_is_read_back():
     text = commented(TREE, {"device": "above", "device.gain": "behind", "long": "before"})
     read = Document("f.yaml", text).data
     assert read == {**TREE, "device": {**TREE["device"], "deep": {"x": 1, "list": (1.0, 2.0)}},
                     "limits": {"drive_v": (0.0, 20.0)}}  # fmt: skip
 
 
-def test_each_comment_stands_with_its_value():
+def test_each_comment_is_beside_its_value():
     comments = {"device": "all of it", "device.gain": "A/V", "limits.drive_v": "low, high"}
     lines = commented(TREE, comments).splitlines()
     assert "device:  # all of it" in lines
@@ -364,7 +364,7 @@ def test_each_comment_stands_with_its_value():
     assert sum("#" in line for line in lines) == len(comments)
 
 
-def test_a_comment_of_a_text_over_several_lines_stands_above_it():
+def test_comment_of_a_long_text_is_above_it():
     lines = commented(TREE, {"long": "what it is for"}).splitlines()
     assert lines[lines.index("# what it is for") + 1].startswith("long: 'a word")
 
@@ -433,7 +433,7 @@ class Several(StrictModel):
     ("names: {A1: 1.0}",
      ["x:1: names.A1: string should match pattern '^[a-z]+$', got 'A1'"]),
 ])  # fmt: skip
-def test_what_may_be_of_several_types(text: str, problems: list[str]) -> None:
+def test_problems_of_union_types(text: str, problems: list[str]) -> None:
     with pytest.raises(ConfigError) as caught:
         Document("x", text).validate(Several)
     assert [str(each) for each in caught.value.problems] == problems
@@ -482,6 +482,6 @@ def read(text, **more):
     ("height_µm: 2.0", r"unknown key \(did you mean 'height_um'\?\)"),
     ("heights_um: 2.0", r"heights_um: unknown key \(removed: set height_um\)"),
 ])  # fmt: skip
-def test_what_can_not_be_decided_is_refused(text, said):
+def test_ambiguous_unions_are_refused(text, said):
     with pytest.raises(ConfigError, match=said):
         read(f"wave:\n  {text}")

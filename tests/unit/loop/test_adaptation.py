@@ -66,7 +66,7 @@ def follow(adapting, actuator, block, noise=None, reference=REFERENCE):
 @pytest.mark.slow
 @pytest.mark.parametrize("block", [1, 50])
 @pytest.mark.parametrize("delay", [0, 13])
-def test_it_finds_what_the_actuator_does(block, delay):
+def test_adaptation_identifies_the_actuator(block, delay):
     adapting, operator = adaptation(delay, delay)
     errors = follow(adapting, Actuator(operator, TRUE, delay), block)
     assert np.abs(errors[:500]).max() > 3.0
@@ -94,7 +94,7 @@ def test_parameters_say_the_whole_operator():
     np.testing.assert_allclose(out, actuator.displacement_um(REFERENCE - 4.0), atol=1e-9)
 
 
-def test_noise_alone_moves_hardly_anything():
+def test_noise_hardly_moves_the_parameters():
     noise = np.random.default_rng(2).normal(0.0, 0.05, REFERENCE.size)
     adapting, operator = adaptation(noise_um=0.05)
     follow(adapting, Actuator(operator, np.zeros(5), 0), 50, noise)
@@ -128,7 +128,7 @@ def test_samples_with_any_flag_change_nothing(flag):
     assert adapting.parameters["offset_um"] == 0.0
 
 
-def test_after_skipped_ticks_lines_begin_anew():
+def test_adaptation_restarts_after_skipped_ticks():
     adapting, _ = adaptation(due_after=5, shown_after=5)
     made = made_block(5)
     made.reference[:] = made.input_um[:] = 10.0
@@ -143,7 +143,7 @@ def test_after_skipped_ticks_lines_begin_anew():
     assert adapting.parameters["offset_um"] > 0.0
 
 
-def test_a_reference_that_stands_shows_the_offset_alone():
+def test_constant_reference_identifies_the_offset_only():
     reference = np.full(4000, 10.0)
     adapting, operator = adaptation(reference=reference)
     follow(adapting, Actuator(operator, np.array([2.0, 0, 0, 0, 0]), 0), 50, reference=reference)
@@ -169,7 +169,7 @@ def test_events():
     assert last.values == event.values
 
 
-def test_bad_bounds_and_time():
+def test_invalid_bounds_and_time_are_refused():
     with pytest.raises(InputError, match="must be >= 0"):
         AdaptationBounds(-1.0, 0.1, 0.0)
     with pytest.raises(InputError, match="slope"):

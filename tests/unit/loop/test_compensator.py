@@ -51,7 +51,7 @@ def test_a_periodic_reference_continues_beyond_its_end(last, continues):
     assert (np.abs(fed - wave[4:]).max() < 0.01) == continues
 
 
-def test_first_command_belongs_to_what_stood_before():
+def test_first_command_belongs_to_the_initial_output():
     step = np.where(np.arange(60) < 1, 0.0, 3.0)
     later = np.concatenate((np.zeros(30), step))
     begun, whole = np.empty(60), np.empty(90)

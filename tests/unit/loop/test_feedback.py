@@ -94,7 +94,7 @@ class TestCorrection:
         before = feedback.correction_um
         assert feedback.correct(0.0, reading, limited=False) == before
 
-    def test_nothing_is_judged_after_a_gap_until_references_are_new(self):
+    def test_correction_is_held_after_a_gap(self):
         feedback = loop(due_after=2)
         for _ in range(5):
             feedback.correct(0.0, 1.0, limited=False)
@@ -142,7 +142,7 @@ class TestPolarity:
     @pytest.mark.parametrize("gain", [0.3, 0.7, 1.0, 1.5])
     @pytest.mark.parametrize("frequency_hz", [1.0, 5.0, 50.0])
     @pytest.mark.parametrize("limit_um", [0.5, 5.0])
-    def test_a_wrong_gain_of_the_right_sign_is_none(self, gain, frequency_hz, limit_um):
+    def test_wrong_gain_is_no_wrong_sign(self, gain, frequency_hz, limit_um):
         feedback = loop(100.0, limit_um)
         plant(feedback, 4000, gain=gain, offset_um=3.0, reference=self.sine(frequency_hz))
         assert feedback.against == ""
@@ -150,7 +150,9 @@ class TestPolarity:
     @pytest.mark.parametrize("bandwidth_hz", [2.0, 20.0, 200.0])
     @pytest.mark.parametrize("drift_um_per_s", [-100.0, -10.0, 10.0, 100.0])
     @pytest.mark.parametrize("frequency_hz", [0.0, 5.0])
-    def test_drift_beyond_the_limit_is_none(self, bandwidth_hz, drift_um_per_s, frequency_hz):
+    def test_drift_beyond_the_limit_is_no_wrong_sign(
+        self, bandwidth_hz, drift_um_per_s, frequency_hz
+    ):
         feedback = loop(bandwidth_hz, 2.0)
         drift = drift_um_per_s * self.TIMES
         plant(feedback, 4000, offset_um=drift, reference=self.sine(frequency_hz))
@@ -158,7 +160,7 @@ class TestPolarity:
         assert feedback.against == ""
 
     @pytest.mark.parametrize("offset_um", [-30.0, 30.0])
-    def test_a_step_beyond_the_limit_is_none(self, offset_um):
+    def test_step_beyond_the_limit_is_no_wrong_sign(self, offset_um):
         feedback = loop(100.0, 2.0)
         step = np.where(self.TIMES > 0.2, offset_um, 0.0)
         plant(feedback, 4000, offset_um=step, reference=self.sine(5.0))
@@ -179,7 +181,7 @@ class TestFollow:
         assert block.input_um[0] == 7.0 + feedback.correction_um
         assert feedback.correction_um == pytest.approx(gains_for(100.0, RATE_HZ).ki_per_s / RATE_HZ)
 
-    def test_gap_is_passed_over(self):
+    def test_gap_changes_no_correction(self):
         feedback, block = loop(due_after=0), self.block()
         feedback.follow(block, block.input_um)
         block.displacement_um[0], block.skipped = -1.0, 3
@@ -187,7 +189,7 @@ class TestFollow:
         feedback.follow(block, block.input_um)
         assert feedback.correction_um == 0.0
 
-    def test_a_command_that_was_held_back_stops_the_integral(self):
+    def test_limited_command_stops_the_integral(self):
         feedback, block = loop(due_after=0), self.block()
         feedback.follow(block, block.input_um)
         block.displacement_um[0], block.wanted[0] = -1.0, 1.0
@@ -240,7 +242,7 @@ class TestAroundModels:
         assert errors[-1000:].max() < 0.1
 
 
-def test_correction_stands_while_the_inverse_is_out():
+def test_correction_is_held_while_the_inverse_is_bypassed():
     feedback, found = loop(), []
     for k in range(100):
         block = made_block()
@@ -281,11 +283,11 @@ def blocks(feedback, count, *, offset_um=0.0, flags=0, size=BLOCK, sign=1.0, ref
 
 class TestIntegralCorrection:
     @pytest.mark.parametrize("due_after", [0, 1, 13])
-    def test_offset_is_taken_out(self, due_after):
+    def test_integral_removes_an_offset(self, due_after):
         fed = blocks(integral(due_after=due_after), 400, offset_um=3.0)
         assert fed[-1] == pytest.approx(-3.0, abs=1e-6)
 
-    def test_it_fades_by_the_bandwidth(self):
+    def test_offset_decays_with_the_bandwidth(self):
         fed = blocks(integral(), 60, offset_um=3.0)
         after = round(BLOCK / GAIN)
         assert fed[after + BLOCK] == pytest.approx(-3.0 * (1.0 - 1.0 / np.e), rel=0.03)
@@ -335,7 +337,7 @@ class TestFrozen:
         assert feedback.correction_um == pytest.approx(-2.7, abs=0.2)
 
     @pytest.mark.parametrize("flag", [Flag.RANGE_LIMITED, Flag.SLEW_LIMITED])
-    def test_limiter_lets_it_shrink_only(self, flag):
+    def test_correction_only_shrinks_behind_the_limiter(self, flag):
         feedback = integral()
         assert set(blocks(feedback, 20, offset_um=3.0, flags=int(flag))) == {0.0}
         blocks(feedback, 100, offset_um=3.0)
@@ -378,7 +380,7 @@ MODEL = PpiModel(direct=9.0, weights=(1.0,), thresholds=(0.01,))
 
 @pytest.mark.parametrize("block", [1, 10])
 @pytest.mark.parametrize("latency", [0, 3])
-def test_in_the_loop_of_a_fifo_device(latency, block):
+def test_offset_is_removed_in_the_loop_of_a_fifo_device(latency, block):
     reference = 5.0 * np.sin(2.0 * np.pi * 5.0 * np.arange(3000) / INTEGRAL_RATE_HZ)
     rig = Rig(
         reference, block=block, device=FakeFifoDevice(latency), model=MODEL,

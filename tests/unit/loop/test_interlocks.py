@@ -133,7 +133,7 @@ FROZEN = replace(STROKE, frozen_s=0.01, frozen_travel=0.5)
 
 
 class TestFrozen:
-    def test_trips_after_its_time(self):
+    def test_condition_trips_after_its_time(self):
         command = np.concatenate((np.zeros(20), np.full(40, 0.6)))
         trip, bench = trips(FROZEN, 60, command=command, displacement=12.34567)
         assert trip == Trip(
@@ -159,7 +159,7 @@ DEVIATION = replace(STROKE, measured_deviation_a=0.5, deviation_s=0.003)
 
 
 class TestDeviation:
-    def test_trips_after_its_time(self):
+    def test_condition_trips_after_its_time(self):
         measured = np.concatenate((np.full(10, 2.0), np.full(10, 2.75)))
         trip, bench = trips(DEVIATION, 20, first=0, command=2.0, measured=measured)
         assert (trip.sample, trip.code) == (13, "deviation")
@@ -219,7 +219,7 @@ TRACKING = replace(STROKE, tracking_error_um=2.0, tracking_s=0.005)
 
 
 class TestTracking:
-    def test_trips_after_its_time(self):
+    def test_condition_trips_after_its_time(self):
         reference = np.concatenate((np.full(10, 1.0), np.full(20, -1.5)))
         trip, bench = trips(TRACKING, 30, reference=reference, displacement=1.0)
         assert trip == Trip(
@@ -268,7 +268,7 @@ class TestSeveral:
             "sensor_invalid", "sensor_frozen", "deviation", "thermal", "tracking_error",
         ]  # fmt: skip
 
-    def test_conditions_that_last_are_told_in_every_block(self):
+    def test_lasting_conditions_trip_in_every_block(self):
         bench = Fed(STROKE)
         assert bench.feed(5, displacement=99.0).sample == 0
         assert bench.feed(5, first=5, displacement=99.0).sample == 5
@@ -319,7 +319,7 @@ class TestTimes:
         ("time_s", "rate_hz", "samples"),
         [(0.0, 1e3, 0), (1e-6, 1e3, 1), (0.07, 100.0, 7), (0.0101, 1e3, 11), (0.003, 5e4, 150)],
     )
-    def test_rounded_up_but_for_the_last_bit(self, time_s, rate_hz, samples):
+    def test_times_are_rounded_up_to_samples(self, time_s, rate_hz, samples):
         """A condition never has less than its time; 0.07 s at 100 Hz are 7 samples, not 8."""
         bench = Fed(replace(TRACKING, tracking_s=time_s), rate_hz)
         assert bench.feed(500, reference=9.0).sample == samples
@@ -335,7 +335,7 @@ class TestTimes:
     ("stroke_um", (1.0, 1.0), "stroke_um must be lowest and highest: 1.0, 1.0"),
     ("sensor_um", (2.0, 1.0), "sensor_um must be lowest and highest: 2.0, 1.0"),
 ])  # fmt: skip
-def test_rig_that_means_nothing_is_refused(field, value, text):
+def test_invalid_rig_is_refused(field, value, text):
     with pytest.raises(InputError) as caught:
         replace(STROKE, **{field: value}).made(RATE_HZ)
     assert str(caught.value) == text

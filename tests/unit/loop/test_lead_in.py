@@ -19,7 +19,7 @@ def short_conditioning(**options):
     return Conditioning(COMMAND, rest=(30, 40), cycle_samples=20, **options)
 
 
-def test_invalid_readings_at_rest_are_left_out():
+def test_invalid_readings_at_rest_are_omitted():
     beginning = LeadIn(short_conditioning(), 0)
     for first, readings in [(30, [np.nan, np.nan]), (32, [1.0, 3.0]), (34, [np.nan, 2.0])]:
         beginning.take(first, np.array(readings))
@@ -116,7 +116,7 @@ class TestLoop:
 class TestOffset:
     @pytest.mark.parametrize("block", [1, 10])
     @pytest.mark.parametrize("latency", [0, 3])
-    def test_what_the_sensor_shows_beside_the_model_is_taken_out(self, latency, block):
+    def test_offset_between_sensor_and_model_is_removed(self, latency, block):
         device = FakeFifoDevice(latency) if latency else FakeDevice()
         given = conditioning(latency, block, stands_um=-3.0, lead_in=50)
         rig = Rig(
@@ -133,7 +133,7 @@ class TestOffset:
         assert event.sample == rig.waveform_at
         assert dict(event.values) == {"offset_um": 3.0, "resting_um": 0.0, "model_um": -3.0}
 
-    def test_nothing_is_taken_out_where_none_is_measured(self):
+    def test_no_offset_is_removed_without_a_measurement(self):
         rig = Rig(sine(50), device=Biased(), conditioning=conditioning(block=1))
         assert rig.run().code == "completed"
         assert rig.host.column(5)[140:190].tolist() == sine(50).tolist()

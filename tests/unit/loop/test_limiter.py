@@ -27,7 +27,7 @@ def test_starts_at_the_safe_value():
 
 @pytest.mark.parametrize("before", SWEEP)
 @pytest.mark.parametrize("after", SWEEP)
-def test_no_pair_of_wishes_gets_out(before, after):
+def test_no_pair_of_requests_exceeds_the_limits(before, after):
     limiter = Limiter(LIMITS, DT_S)
     last = limiter.last
     for wish in (before, after) * 40:
@@ -60,7 +60,7 @@ def test_ramp_ends_exactly_at_the_safe_value():
 
 class TestFromElsewhere:
     @pytest.mark.parametrize("start", [-50.0, -2.001, -1.9, 0.61, 2.9, 3.1, 40.0])
-    def test_the_ramp_takes_the_samples_that_it_says(self, start):
+    def test_ramp_has_the_promised_length(self, start):
         limiter = Limiter(LIMITS, DT_S)
         limiter.last = start
         samples = limiter.ramp_samples
@@ -74,7 +74,7 @@ class TestFromElsewhere:
 
     @pytest.mark.parametrize("wish", [np.nan, -1e9, 0.0, 1e9])
     @pytest.mark.parametrize("start", [-9.0, 9.0])
-    def test_no_wish_jumps_from_outside(self, start, wish):
+    def test_no_request_jumps_from_outside_the_limits(self, start, wish):
         limiter = Limiter(LIMITS, DT_S)
         limiter.last = start
         command, _ = limited(limiter, np.full(3, wish))
@@ -121,7 +121,7 @@ FIELDS = {"low": -2.0, "high": 3.0, "slew_per_s": 100.0, "safe": 0.5, "ramp_per_
     ("slew limit", "ramp_per_s", [0.0, 101.0]),
     ("slew limit", "slew_per_s", [np.inf]),
 ])  # fmt: skip
-def test_limits_that_mean_nothing_are_refused(rule, key, values):
+def test_invalid_limits_are_refused(rule, key, values):
     """The error names the values that break the rule."""
     for value in values:
         with pytest.raises(InputError, match=rule) as caught:

@@ -100,7 +100,7 @@ def test_work_before_the_exchange_is_lateness():
     assert set(late_ns.values()) == {0, 700_000}
 
 
-def test_blocks_make_no_difference():
+def test_block_size_makes_no_difference():
     commands = []
     for block in (1, 8, 40):
         rig = Rig(10.0 * sine(400), block=block, model=terfenol_rdpi())
@@ -147,7 +147,7 @@ def test_input_is_recorded_beside_the_reference(block):
     assert rig.host.column(1)[:230].tolist() == wanted.tolist()
 
 
-def test_tuning_moves_reference_and_what_is_fed_alike():
+def test_tuning_moves_reference_and_input_equally():
     reference = 10.0 * sine(200)
     ahead = np.concatenate((reference[4:], np.full(4, reference[-1])))
     tunings = {40: Tuning(0.5, 0.1, 20)}
@@ -161,7 +161,7 @@ def test_tuning_moves_reference_and_what_is_fed_alike():
     assert (event.sample, event.code, event.values["samples"]) == (40, "tuned", 20)
 
 
-def test_reference_passes_through_where_nothing_compensates():
+def test_reference_is_the_command_without_a_compensator():
     rig = Rig(sine(50))
     rig.run()
     for row in (0, 1, 5):
@@ -225,7 +225,7 @@ def test_lost_device_is_made_safe():
     assert rig.host.closed
 
 
-def test_an_end_that_the_device_cannot_confirm_is_not_called_safe():
+def test_unconfirmed_end_is_not_safe():
     rig = Rig(np.full(100, 2.0), device=FakeDevice(info=FakeInfo(confirms=False)))
     outcome = rig.run()
     assert (outcome.code, outcome.output, outcome.safe) == ("completed", "sent", False)
@@ -280,7 +280,7 @@ def test_a_watchdog_that_cannot_be_armed_ends_as_an_exchange_that_fails():
     assert [event.code for event in rig.host.events] == ["device_lost"]
 
 
-def test_lost_device_that_stays_lost_is_said():
+def test_device_that_stays_lost_is_reported():
     rig = Rig(np.full(100, 2.0), device=FakeDevice(break_at=60, safe_works=False))
     outcome = rig.run()
     assert not outcome.safe
@@ -361,7 +361,7 @@ LATENCIES = [1, 3, 8]
 
 
 @pytest.mark.parametrize("latency", LATENCIES)
-def test_displacements_that_come_later_stand_beside_their_commands(latency):
+def test_delayed_displacements_are_recorded_with_their_commands(latency):
     rig = Rig(sine(230), block=10, device=FakeFifoDevice(latency))
     outcome = rig.run()
     plain = Rig(sine(230), block=10)
@@ -375,7 +375,7 @@ def test_displacements_that_come_later_stand_beside_their_commands(latency):
 
 
 @pytest.mark.parametrize("latency", LATENCIES)
-def test_last_blocks_are_waited_for_at_the_safe_value(latency):
+def test_last_blocks_are_awaited_at_the_safe_value(latency):
     device = FakeFifoDevice(latency)
     outcome = Rig(sine(230), block=10, device=device).run()
     assert len(device.commands) == outcome.ended_at + 10 * latency
@@ -401,7 +401,7 @@ def test_sensor_lost_behind_a_fifo_ramps_down(latency, nan_at):
 @pytest.mark.parametrize(
     ("latency", "break_at"), [(3, 5), (3, 25), (3, 60), (3, 205), (3, 235), (0, 60)]
 )
-def test_blocks_under_way_to_a_lost_device_are_recorded(latency, break_at):
+def test_unanswered_blocks_of_a_lost_device_are_recorded(latency, break_at):
     device = FakeFifoDevice(latency, break_at=break_at)
     rig = Rig(sine(200), block=10, device=device)
     outcome = rig.run()
@@ -422,7 +422,7 @@ def test_blocks_under_way_to_a_lost_device_are_recorded(latency, break_at):
 
 
 @pytest.mark.parametrize("latency", [0, 3])
-def test_what_is_on_its_way_can_be_seen_before_it_is_sent(latency):
+def test_blocks_are_published_before_they_are_sent(latency):
     seen = []
 
     class Looked(FakeFifoDevice):
@@ -461,7 +461,7 @@ def test_tuning_in_the_ramp_after_the_waveform_is_not_taken():
     assert not rig.host.events
 
 
-def test_invalid_wish_in_the_last_block_is_a_fault():
+def test_invalid_request_in_the_last_block_is_a_fault():
     reference = np.full(11, 2.0)
     reference[-1] = np.nan
     outcome = Rig(reference, block=8).run()
@@ -511,7 +511,7 @@ def test_skipped_ticks_move_a_tuning_on():
     assert rig.host.columns[at][0][0] == pytest.approx(2.0 * (1.0 - 0.5 * 21 / 40))
 
 
-def test_inverse_that_comes_back_in_has_the_memory_of_one_that_was_never_out():
+def test_enabled_inverse_has_the_memory_of_one_never_bypassed():
     reference = 10.0 * sine(400)
     line = LinearBypass(0.1, 0.25)
     out, back = Tuning(1.0, 0.0, 20, 0, 0.0, line), Tuning(1.0, 0.0, 30, 0, 1.0, line)
@@ -548,7 +548,7 @@ def test_skipped_ticks_move_a_fade_on():
     assert rig.host.columns[at][1][0] == pytest.approx(expected, rel=1e-12)
 
 
-def test_the_last_block_may_be_no_whole_one():
+def test_last_block_may_be_shorter():
     rig = Rig(np.full(204, 2.0), block=10)
     assert rig.run().code == "completed"
     assert rig.device.commands[203:205] == [2.0, 2.0 - LIMITS.ramp_per_s / RATE_HZ]

@@ -59,7 +59,7 @@ def test_late_is_later_than_the_limit(late_ns, counted):
     assert paced.counters.worst_tick == 3
 
 
-def test_skip_leaves_out_ticks_and_keeps_the_phase():
+def test_skipped_ticks_keep_the_phase():
     clock = FakeClock(5_000, {2: 3_200_000})
     paced = pacer(clock)
     assert [paced.wait() for _ in range(4)] == [0, 0, 3, 0]
@@ -115,10 +115,10 @@ class TestMisses:
                 return reason, paced.tick
         return "", paced.tick
 
-    def test_one_long_stall_is_let_pass(self):
+    def test_one_long_stall_is_tolerated(self):
         assert self.stalled({3: 900 * PERIOD_NS})[0] == ""
 
-    def test_a_share_that_goes_on_is_not(self):
+    def test_repeated_misses_end_the_run(self):
         reason, tick = self.stalled(dict.fromkeys(range(400), 125 * PERIOD_NS))
         assert tick == 5 * 126 - 1
         assert reason.startswith(
@@ -130,11 +130,11 @@ class TestMisses:
         single = {20 * number: PERIOD_NS for number in range(stalls)}
         assert bool(self.stalled(single)[0]) == ends
 
-    def test_what_lies_behind_the_window_is_forgotten(self):
+    def test_misses_before_the_window_do_not_count(self):
         seldom = {100 * number: PERIOD_NS for number in range(200)}
         assert self.stalled(seldom, ticks=20_000)[0] == ""
 
-    def test_what_is_forgotten_makes_room_for_no_more_than_it_was(self):
+    def test_window_counts_no_miss_twice(self):
         seldom = {100 * number: PERIOD_NS for number in range(30)}
         assert self.stalled(seldom | {2950: PERIOD_NS}, ticks=4000)[0]
 
@@ -151,7 +151,7 @@ class TestMisses:
     (944, 3003, "deadline misses 944 of 3003 (31 %): timing not kept"),
     (3, 0, "deadline misses 3 of 0 (3e+02 %): timing not kept"),
 ])  # fmt: skip
-def test_misses_in_words(skipped, due, text):
+def test_text_of_deadline_misses(skipped, due, text):
     assert deadline_misses(skipped, due, 0.01) == text
 
 
@@ -214,7 +214,7 @@ class TestTooLate:
         assert paced.too_late() == (said if ends else "")
 
     @pytest.mark.parametrize(("ticks", "ends"), [(5, False), (6, True)])
-    def test_so_many_in_a_row_end_it(self, ticks, ends):
+    def test_consecutive_late_ticks_end_the_run(self, ticks, ends):
         stalls_ns = {0: PERIOD_NS, 3: 100 * PERIOD_NS}
         paced = self.paced(stalls_ns, ticks, max_consecutive_late=3)
         assert paced.too_late() == ("3 ticks in a row woke late, up to tick 5" if ends else "")
@@ -232,7 +232,7 @@ class TestFollow:
             clock.now += exchange_ns(tick)
         return paced, late_ns
 
-    def test_waits_only_for_the_start(self):
+    def test_following_pacer_waits_only_for_the_start(self):
         clock = FakeClock(5_000)
         self.run(clock, lambda _: PERIOD_NS, 100)
         assert clock.sleeps == 1

@@ -55,7 +55,7 @@ def driven(amplifier, until_s=1e3, *, start=4.0, pending=False, ramp_per_s=20.0)
 
 @pytest.mark.parametrize("start", [4.0, -4.0])
 @pytest.mark.parametrize("takes_s", [0.0, 0.001, 0.03])
-def test_the_way_is_a_ramp_by_time(start, takes_s):
+def test_safe_value_is_approached_by_a_ramp(start, takes_s):
     amplifier = Amplifier(start, takes_s)
     output = driven(amplifier, start=start)
     times, values = zip(*amplifier.writes, strict=True)
@@ -96,14 +96,14 @@ def test_an_older_command_that_is_executed_late_is_corrected_within_one_repeat(l
     assert (output.state, amplifier.older, amplifier.output) == ("set", None, 0.0)
 
 
-def test_a_ramp_value_without_answer_may_be_executed_late_too():
+def test_unanswered_ramp_value_may_be_executed_late():
     amplifier = Amplifier(older=(102.3, 3.0))
     amplifier.down_until_s = amplifier.now_s + 1.0
     output = driven(amplifier, until_s=103.0)
     assert (output.state, amplifier.older, amplifier.output) == ("set", None, 0.0)
 
 
-def test_an_older_command_is_never_confirmed_not_to_follow():
+def test_pending_command_prevents_confirmation():
     amplifier = Amplifier()
     output = driven(amplifier, until_s=1e4, start=None, pending=True)
     assert (output.state, output.final) == ("set", False)
@@ -126,7 +126,7 @@ def test_a_device_that_cannot_confirm_is_sent_the_value_several_times():
 
 
 @pytest.mark.parametrize("number", [errno.EMFILE, errno.ENFILE, errno.ENOMEM])
-def test_what_this_process_lacks_is_not_taken_for_the_device(number):
+def test_exhausted_process_is_no_device_error(number):
     amplifier = Amplifier()
     amplifier.error = DeviceError("cannot connect")
     amplifier.error.__context__ = OSError(number, "none left")
@@ -134,7 +134,7 @@ def test_what_this_process_lacks_is_not_taken_for_the_device(number):
         driven(amplifier)
 
 
-def test_driving_ends_as_soon_as_nothing_is_gained_by_waiting():
+def test_driving_ends_when_waiting_gains_nothing():
     amplifier = Amplifier()
     output = drive_to_safe(
         amplifier, SafeGoal(0.0, 20.0, 4.0, pending=True), amplifier.clock, amplifier.sleep
@@ -143,7 +143,7 @@ def test_driving_ends_as_soon_as_nothing_is_gained_by_waiting():
     assert amplifier.now_s == pytest.approx(100.2, abs=0.02)
 
 
-def test_driving_ends_after_its_patience():
+def test_driving_ends_after_its_time_limit():
     amplifier = Amplifier()
     amplifier.down_until_s = 1e9
     output = drive_to_safe(

@@ -119,7 +119,7 @@ def test_marks_follow_the_initial_ramp():
     assert rig.flagged == [ramp]
 
 
-def test_a_mark_in_skipped_ticks_is_late_and_not_lost():
+def test_mark_in_skipped_ticks_is_delayed():
     rig = Rig(marks=np.array([10, 14]), clock=FakeClock(stall_ns={9: 4 * MS}))
     rig.run()
     assert rig.flagged == [13, 15]  # low in between
@@ -157,7 +157,7 @@ def test_start_by_the_input(start, high_from, reads):
     assert rig.host.heads[0][BlockHeader.DEADLINE_NS] == 0
 
 
-def test_a_start_that_does_not_come_ends_the_run_at_the_safe_value():
+def test_missing_start_signal_ends_the_run_at_the_safe_value():
     rig = Rig(start="high", timeout_s=0.5, device=DigitalDouble(high_from=10**9))
     outcome = rig.run()
     assert (outcome.code, outcome.output) == ("fault", "confirmed")

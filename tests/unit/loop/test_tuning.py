@@ -32,19 +32,19 @@ def run(tuner, reference, block, moves):
     return out
 
 
-def test_untouched_reference_passes_bit_for_bit():
+def test_untuned_reference_is_unchanged_bit_for_bit():
     reference = np.random.default_rng(1).normal(size=100)
     assert run(ReferenceTuner(), reference, 7, {}).tobytes() == reference.tobytes()
 
 
-def test_change_is_a_straight_ramp_to_exactly_what_is_wanted():
+def test_change_is_a_linear_ramp_to_the_exact_value():
     out = run(ReferenceTuner(), np.ones(100), 10, {20: Tuning(0.3, 0.4, 30)})
     assert (out[:20] == 1.0).all()
     assert np.diff(out[19:50]) == pytest.approx(np.full(30, -0.3 / 30))
     assert (out[50:] == 0.3 * 1.0 + 0.4).all()
 
 
-def test_second_change_begins_where_the_first_stands():
+def test_second_change_begins_at_the_present_value():
     out = run(
         ReferenceTuner(), np.ones(100), 5, {10: Tuning(0.0, 0.0, 50), 30: Tuning(1.0, 0.0, 20)}
     )
@@ -95,7 +95,7 @@ def faded(tuner, reference, wanted, block, moves):
     return out, flags == Flag.INVERSE_OUT
 
 
-def test_inverse_goes_over_to_the_line_and_back_to_the_bit():
+def test_bypass_and_return_are_exact():
     reference, wanted = np.random.default_rng(1).normal(size=(2, 200))
     wanted[150] = -0.0
     out, flagged = faded(ReferenceTuner(), reference, wanted, 10, {40: FADE, 100: BACK})

@@ -74,7 +74,7 @@ class TestFold:
         assert set(folded.signals[0]) == {1.0}
         assert set(folded.signals[1]) == {2.0}
 
-    def test_empty_bins_are_dropped_and_a_hole_is_told(self) -> None:
+    def test_empty_bins_are_dropped_and_a_hole_is_reported(self) -> None:
         index = np.arange(1000, dtype=np.int64)
         for lost, whole in ((1, True), (40, True), (60, False), (500, False)):
             kept = index[index % 1000 >= lost]
@@ -115,7 +115,7 @@ class TestPeakHysteresis:
         y = steady_play(u, 1e-9, 1.0, 4.0)
         assert cycle_metrics.peak_hysteresis_percent(u, y) == pytest.approx(100.0, rel=1e-6)
 
-    def test_is_the_same_either_way_round_and_from_any_start(self) -> None:
+    def test_hysteresis_is_independent_of_direction_and_start(self) -> None:
         u = triangle(6.0, 1200)
         y = steady_play(u, 1.0, 2.0, 1.5)
         expected = cycle_metrics.peak_hysteresis_percent(u, y)
@@ -125,7 +125,7 @@ class TestPeakHysteresis:
             rolled = cycle_metrics.peak_hysteresis_percent(np.roll(u, start), np.roll(y, start))
             assert rolled == pytest.approx(expected)
 
-    def test_does_not_see_what_is_a_function_of_the_input(self) -> None:
+    def test_nonlinearity_is_no_hysteresis(self) -> None:
         t = 2.0 * np.pi * np.arange(500) / 500
         u, y = np.sin(t), np.sin(t - 0.2)
         plain, bent = (
@@ -150,7 +150,7 @@ class TestPeakHysteresis:
         assert found.height == pytest.approx(expected, rel=0.01)
         assert found.height == pytest.approx(crossing_gap(u, y, found.at_input), rel=1e-9)
 
-    def test_input_that_stands_still_goes_on_with_its_branch(self) -> None:
+    def test_constant_input_belongs_to_its_branch(self) -> None:
         t = 2.0 * np.pi * np.arange(1000) / 1000
         u = np.clip(np.sin(t), -0.8, 0.8)
         y = np.sin(t - 0.2)
@@ -176,7 +176,7 @@ class TestPeakHysteresis:
             0.0, abs=1e-10
         )
 
-    def test_no_meaning_gives_none(self) -> None:
+    def test_meaningless_input_gives_none(self) -> None:
         wave = np.sin(np.arange(10.0))
         assert cycle_metrics.peak_hysteresis_percent(np.ones(10), wave) is None
         assert cycle_metrics.peak_hysteresis_percent(wave, np.ones(10)) is None

@@ -39,7 +39,7 @@ class TestSoft:
         np.testing.assert_allclose(values[:200], grow * hard[:200], rtol=0.0, atol=1e-12)
         np.testing.assert_allclose(values[700:], shrink * hard[700:], rtol=0.0, atol=1e-12)
 
-    def test_from_and_to_where_the_actuator_rests(self, made: Made) -> None:
+    def test_soft_start_and_end_at_the_rest_position(self, made: Made) -> None:
         keys = {**SINE, "offset": 40.0, "duration_s": 1.0}
         hard = made(1000.0, **keys).values
         soft = made(1000.0, **keys, rest=50.0, soft_start_s=0.2, soft_end_s=0.3).values
@@ -48,7 +48,7 @@ class TestSoft:
         grow = np.array([raised_cosine(k / 200) for k in range(200)])
         np.testing.assert_allclose(soft[:200], 50.0 + grow * (hard[:200] - 50.0), atol=1e-12)
 
-    def test_segment_leaves_soft_parts_out(self, made: Made) -> None:
+    def test_steady_part_excludes_soft_start_and_end(self, made: Made) -> None:
         reference = made(1000.0, **SINE, duration_s=1.0, soft_start_s=0.2, soft_end_s=0.3)
         assert reference.segments == (Segment("sine 6 A 10 Hz", 0, 1000, 200, 700, 100.0),)
 
@@ -65,7 +65,7 @@ class TestSequence:
         {"kind": "triangle", "amplitude": 1.0, "frequency_hz": 20.0, "duration_s": 0.3},
     )
 
-    def test_segments_stand_where_their_parts_do(self, made: Made) -> None:
+    def test_segments_are_at_their_parts(self, made: Made) -> None:
         reference = made(1000.0, kind="sequence", unit="A", parts=self.PARTS, repeat=2)
         one = (
             Segment("sine 6 A 10 Hz", 0, 500, 100, 500, 100.0),
@@ -223,7 +223,7 @@ def test_the_same_samples_however_long(
     assert long.span == pytest.approx(whole.span, rel=5e-3)
 
 
-def test_what_repeats_is_told_by_some_of_it(made: Made, small: None) -> None:
+def test_periodic_waveform_is_checked_in_part(made: Made, small: None) -> None:
     long = made(1000.0, **WAVES[0] | {"duration_s": 1000.0}, **SOFT)
     told = np.concatenate([*chunks(long.values, long.telling)])
     assert told.size < 5000 < long.values.size
@@ -233,7 +233,7 @@ def test_what_repeats_is_told_by_some_of_it(made: Made, small: None) -> None:
     assert long.span == pytest.approx((everything.min(), everything.max()), rel=1e-3)
 
 
-def test_a_repeated_sequence_is_told_by_one_of_it(made: Made, small: None) -> None:
+def test_repeated_sequence_is_checked_once(made: Made, small: None) -> None:
     sequence = waveforms()[-1] | {"repeat": 50}
     long = made(1000.0, **sequence)
     first = long.telling[0]
@@ -242,12 +242,12 @@ def test_a_repeated_sequence_is_told_by_one_of_it(made: Made, small: None) -> No
     assert long.repeats == (RepeatedPart(0, long.values.size, float(once)),)
 
 
-def test_what_does_not_repeat_is_told_by_all_of_it(made: Made, small: None) -> None:
+def test_nonperiodic_waveform_is_checked_completely(made: Made, small: None) -> None:
     chirp = made(1000.0, **WAVES[4])
     assert chirp.telling == (slice(0, 4000),)
 
 
-def test_a_value_that_is_none_is_refused_wherever_it_is(made: Made, small: None) -> None:
+def test_nonfinite_value_is_refused_anywhere(made: Made, small: None) -> None:
     keys = {"kind": "growing", "amplitude": 1.7e308, "offset": 1.7e308, "frequency_hz": 0.3}
     with pytest.raises(InputError, match="too large"):
         made(1000.0, **keys, duration_s=40.0)
@@ -288,7 +288,7 @@ def rows(*columns: Any, delimiter: str = ",") -> str:
 
 
 @pytest.mark.parametrize("suffix", [".csv", ".npy", ".mcap"])
-def test_name_that_no_file_can_have(made: Made, tmp_path: Path, suffix: str) -> None:
+def test_impossible_file_name_is_refused(made: Made, tmp_path: Path, suffix: str) -> None:
     with pytest.raises(InputError, match="name too long"):
         made(RATE_HZ, tmp_path, kind="file", path="x" * 300 + suffix, file_rate_hz=RATE_HZ)
 
@@ -457,7 +457,7 @@ class TestNpy:
         ["(10**15,)", "(1000000000000000,)", "(4294967296, 4294967296)", "(9223372036854775808,)",
          "(-1,)", "(True,)", "(" * 5000, "('''"],
     )  # fmt: skip
-    def test_head_that_lies(self, read: Read, shape: str) -> None:
+    def test_wrong_header_is_refused(self, read: Read, shape: str) -> None:
         head = f"{{'descr': '<f8', 'fortran_order': False, 'shape': {shape}, }}\n".encode()
         content = b"\x93NUMPY\x01\x00" + len(head).to_bytes(2, "little") + head + bytes(80)
         text = refusal(read, content, "w.npy", file_rate_hz=RATE_HZ)

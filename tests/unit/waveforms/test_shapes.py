@@ -114,7 +114,7 @@ class TestRandom:
         assert abs(np.corrcoef(first, second)[0, 1]) < 0.2
         np.testing.assert_array_equal(first, made(RATE_HZ, **self.KEYS, seed=1).values)
 
-    def test_nothing_in_it_repeats(self, made: Made) -> None:
+    def test_random_waveform_does_not_repeat(self, made: Made) -> None:
         values = made(RATE_HZ, **self.KEYS).values
         spectrum = np.abs(np.fft.rfft(values, 2 * values.size)) ** 2
         alike = np.fft.irfft(spectrum)[: values.size]
@@ -140,13 +140,13 @@ class TestPath:
 
 class TestChirp:
     @pytest.mark.parametrize("stop_hz", [5.0, np.nextafter(5.0, 6.0)])
-    def test_a_frequency_that_stands_still(self, made: Made, stop_hz: float) -> None:
+    def test_chirp_of_constant_frequency(self, made: Made, stop_hz: float) -> None:
         keys = {"start_hz": 5.0, "stop_hz": float(stop_hz), "duration_s": 1.0}
         values = made(1000.0, kind="chirp", amplitude=2.0, spacing="logarithmic", **keys).values
         expected = sampled(lambda t: 2.0 * math.sin(10 * math.pi * t), 1000, 1000.0)
         np.testing.assert_allclose(values, expected, rtol=0.0, atol=1e-11)
 
-    def test_from_a_frequency_near_nothing(self, made: Made) -> None:
+    def test_chirp_to_a_tiny_frequency(self, made: Made) -> None:
         keys = {"start_hz": 400.0, "stop_hz": 1e-320, "duration_s": 1.0}
         values = made(1000.0, kind="chirp", amplitude=2.0, spacing="logarithmic", **keys).values
         assert np.isfinite(values).all()

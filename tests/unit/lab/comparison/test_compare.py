@@ -40,7 +40,7 @@ def test_everything_goes_into_json(comparison):
 
 @pytest.mark.slow
 @pytest.mark.parametrize("text", ["", "device: {kind: serial_dac, port: /dev/ttyUSB9}"])
-def test_loops_of_a_real_device_are_judged_without_trials(monkeypatch, text):
+def test_loops_of_a_real_device_are_compared_without_trials(monkeypatch, text):
     recording = read(GOLDEN)
     run = {**recording.run, "simulated": "false"}
     recording = replace(recording, experiment_yaml=text, run=run)

@@ -59,7 +59,7 @@ def test_trials_start_from_rest():
     assert rig.run(piezo_ppi(), rig.references[0]) == first
 
 
-def test_a_ramp_from_elsewhere_is_not_evaluated():
+def test_initial_ramp_is_not_evaluated():
     elsewhere = TEXT.replace("simulated_piezo", "simulated_piezo, output_at_open: 30.0")
     trials = [
         (rig := device(SINE, text=text)).run(piezo_ppi(), rig.references[0])[0]

@@ -12,7 +12,7 @@ SCRIPT = "<script>alert(1)</script> $x$ & 'y'"
 NASTY = "<b onclick='x'>&\x1b"
 
 
-def test_no_part_takes_a_text_for_markup():
+def test_texts_are_escaped():
     parts = [
         html.paragraph(NASTY, "note"),
         html.rows(NASTY, [(NASTY, NASTY)]),

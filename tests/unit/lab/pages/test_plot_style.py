@@ -53,7 +53,7 @@ def test_band_follows_the_index_across_gaps() -> None:
     assert not ((middle > 11_000) & (middle < 89_000)).any()
 
 
-def test_band_is_for_many_narrow_cycles() -> None:
+def test_many_narrow_cycles_are_a_band() -> None:
     assert plot_style.shown_as_band(100_000, 200.0, 100_000)
     assert not plot_style.shown_as_band(100_000, 2000.0, 100_000)
     assert not plot_style.shown_as_band(700, 200.0, 100_000)

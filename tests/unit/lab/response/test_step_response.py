@@ -29,7 +29,7 @@ def test_frequency_and_damping_are_found(natural_hz, damping):
     assert found.misfit_um < 0.1
 
 
-def test_where_nothing_rings_there_is_none():
+def test_overdamped_step_has_no_frequency():
     creep = 7.0 - 3.0 * np.exp(-T / 2e-3)
     noise = 0.036 * np.random.default_rng(4).standard_normal(T.size)
     assert ringing(creep + noise, RATE_HZ) is None

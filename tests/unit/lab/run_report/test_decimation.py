@@ -65,7 +65,7 @@ def small(monkeypatch):
     monkeypatch.setattr(module, "_LAST_SAMPLES", 8_000)
 
 
-def test_a_short_one_is_the_whole(recording):
+def test_short_recording_is_not_decimated(recording):
     found = overview(Parts(recording))[1]
     assert not isinstance(found, Overview)
     assert np.array_equal(found.samples.index, recording.samples.index)
@@ -73,7 +73,7 @@ def test_a_short_one_is_the_whole(recording):
     assert found.ticks.late_ns.tolist() == recording.ticks.late_ns.tolist()
 
 
-def test_a_long_one_keeps_its_spikes_and_what_is_judged(small, recording):
+def test_decimated_recording_keeps_spikes_and_evaluated_samples(small, recording):
     found = overview(Parts(recording))[1]
     assert isinstance(found, Overview)
     assert found.samples.index.size < 30_000
@@ -95,7 +95,7 @@ def test_a_long_one_keeps_its_spikes_and_what_is_judged(small, recording):
         assert samples.index[-1] == whole.samples.index[-1]
 
 
-def test_its_plots_can_be_drawn(small, recording):
+def test_plots_of_a_decimated_recording_are_drawn(small, recording):
     found = overview(Parts(recording))[1]
     assert hysteresis_loop(found) is not None
     assert all(draw(found) is not None for draw in (plots.time_history, plots.error))
@@ -104,7 +104,7 @@ def test_its_plots_can_be_drawn(small, recording):
     assert index.tolist() == list(range(29_500 - 1000, 29_500))
 
 
-def test_its_page_has_the_figures_of_the_whole(small, recording, undrawn):
+def test_page_of_a_decimated_recording_has_the_metrics_of_the_whole(small, recording, undrawn):
     pieces = Parts(recording)
     summary, shown = overview(pieces)
     assert pieces.walks == 1
@@ -113,7 +113,7 @@ def test_its_page_has_the_figures_of_the_whole(small, recording, undrawn):
     assert "Results" in page(shown, summary)
 
 
-def test_many_ticks_are_told_by_some_of_them(small, monkeypatch, recording):
+def test_ticks_are_decimated(small, monkeypatch, recording):
     """Evenly, so that their distribution stays, and the latest."""
     monkeypatch.setattr(module, "_MOST_TICKS", 200)
     ticks = overview(Parts(recording))[1].ticks

@@ -245,7 +245,7 @@ def test_before_and_after_are_drawn_over_their_own_ranges(make_recording):
     assert before_and_after(make_recording(wave_um), after) is None
 
 
-def test_a_command_that_stands_has_a_level_line(make_recording):
+def test_constant_command_has_a_level_line(make_recording):
     part = Segment("constant", 0, 1000, 0, 1000, 0.0)
     displacement_um = np.linspace(1.0, 3.0, 1000)
     recording = make_recording(displacement_um, command=np.full(1000, 2.0), segments=[part])

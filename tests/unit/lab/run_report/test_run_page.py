@@ -116,7 +116,7 @@ def test_cut_short_recording_has_a_page(recording: Recording) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_a_fault_stands_above_all_figures_and_once(recording: Recording) -> None:
+def test_fault_is_shown_once_above_the_figures(recording: Recording) -> None:
     ended = {"code": "fault", "reason": "device gone", "output_safe": "false"}
     events = (Event(100, "error", "lost", "device gone"), Event(120, "error", "more", "no answer"))
     failed = replace(recording, end=ended, events=events)
@@ -169,7 +169,7 @@ def test_only_the_last_events_are_listed(recording: Recording) -> None:
 
 
 @pytest.mark.usefixtures("undrawn")
-def test_readings_near_the_end_of_all_numbers_are_told_in_words(recording: Recording) -> None:
+def test_largest_numbers_have_no_figure(recording: Recording) -> None:
     """No axis can show them; the figures in words stay."""
     samples = recording.samples
     huge = replace(samples, displacement_um=np.where(samples.index % 2, 1.7e308, -1.7e308))
@@ -180,7 +180,7 @@ def test_readings_near_the_end_of_all_numbers_are_told_in_words(recording: Recor
 
 
 @pytest.mark.slow
-def test_what_steers_a_browser_or_a_plot_is_written_out(recording: Recording) -> None:
+def test_control_characters_of_labels_are_escaped(recording: Recording) -> None:
     label = "$\\frac{$ \x1b[31m \u202e" + "x" * 100_000
     named = tuple(replace(segment, label=label) for segment in recording.segments)
     changed = replace(recording, segments=named)
@@ -214,7 +214,7 @@ def described(make_recording):
     return replace(made, labels=labels, model_yaml=MODEL.read_text())
 
 
-def test_it_says_when_by_whom_with_what_and_what_was_wanted(described):
+def test_provenance_has_date_operator_device_and_settings(described):
     rows = dict(provenance_rows(described))
     assert rows["date"] == "2026-11-22 14:40:15 UTC"
     assert (rows["operator"], rows["sample"]) == ("Ada\\x1b", "A7")
@@ -239,7 +239,7 @@ def test_a_model_s_error_on_unseen_data_comes_first():
     assert unseen.startswith("2.00 % peak, 0.700 % rms, ")
 
 
-def test_what_is_not_recorded_has_no_row(described):
+def test_missing_facts_have_no_row(described):
     rows = dict(provenance_rows(replace(described, run={}, labels={}, model_yaml="")))
     assert set(rows) == {"waveform", "compensator"}
     broken = replace(
