@@ -1,4 +1,4 @@
-"""Runs in the background: status, set and stop from outside, and what they may not do."""
+"""Runs in the background: status, set and stop by other processes, and invalid requests."""
 
 import json
 import os
@@ -30,7 +30,7 @@ STOPPED = "stopped by hilctl stop"
 
 
 def hilctl(*words, code=0):
-    """Run a command; return what it printed as JSON, or its error text where it must fail."""
+    """Run a command; return its JSON, or its error text if it must fail."""
     if code:
         return commands.hilctl(*words, code=code).stderr
     return json.loads(commands.hilctl(*words, "--json").stdout)
@@ -114,7 +114,7 @@ def test_background_run_is_seen_changed_and_stopped(background):
 
 
 def test_bad_messages_change_nothing(going):
-    """Garbage, unknown orders and wrong types are refused in words, and the run goes on."""
+    """Garbage, unknown commands and wrong types are refused with a message."""
     (run,) = runs()
     for raw, words in {
         b"not json\n": "invalid JSON",
@@ -147,7 +147,7 @@ SEEDS = (
 
 
 def mangled(chance):
-    """Return a message: noise, or an order with a few bytes changed, taken out or put in."""
+    """Return a message: noise, or a request with a few bytes changed, removed or inserted."""
     if chance.random() < 0.2:
         return chance.randbytes(chance.randrange(1, 6000))
     raw = bytearray(chance.choice(SEEDS))
@@ -159,7 +159,7 @@ def mangled(chance):
 
 
 def say(socket_path, raw):
-    """Say something to a run; return its answer, empty where it cut us off."""
+    """Send bytes to a run; return its answer, empty if it closed the connection."""
     with socket.socket(socket.AF_UNIX, socket.SOCK_STREAM) as client:
         client.settimeout(10.0)
         client.connect(str(socket_path))
@@ -172,7 +172,7 @@ def say(socket_path, raw):
 
 
 def test_hundreds_of_mangled_messages_do_not_disturb_a_run(going):
-    """Each is answered or cut off, silent clients too; samples go on all the while."""
+    """Each is answered or disconnected, silent clients too; no sample is lost."""
     (run,) = runs()
     before, chance = hilctl("status")["runs"][0], random.Random(7)
     answers = [say(run.socket, mangled(chance)) for _ in range(400)]
@@ -192,7 +192,7 @@ def test_hundreds_of_mangled_messages_do_not_disturb_a_run(going):
 
 @contextmanager
 def crowd(socket_path, size):
-    """Keep so many clients connected that say nothing, each again as soon as it is sent away."""
+    """Keep a number of silent clients connected; each reconnects when it is disconnected."""
     over = threading.Event()
 
     def stay():
@@ -215,7 +215,7 @@ def crowd(socket_path, size):
 
 
 def test_requests_work_with_many_clients(going):
-    """Status and set are answered, and the run goes on undisturbed."""
+    """Status and set are answered, and no sample is lost."""
     (run,) = runs()
     before = await_state("running")
     with crowd(run.socket, 100):
@@ -228,7 +228,7 @@ def test_requests_work_with_many_clients(going):
 
 
 def test_two_simultaneous_changes_are_both_applied(going):
-    """The second begins once the loop has taken the first, and leads to what both asked for."""
+    """The second begins after the loop has taken the first, and the result has both."""
     commands = [["set", "gain=0.5", "--over", "0.5"], ["set", "offset=0.5", "--over", "0.1"]]
     await_state("running")
     with ThreadPoolExecutor(2) as pool:
@@ -242,7 +242,7 @@ def test_two_simultaneous_changes_are_both_applied(going):
 
 
 def test_stop_works_with_many_clients(background):
-    """Its supervisor is told by a signal, which no client can take the place of."""
+    """The supervisor is stopped by a signal, which no client can block."""
     await_state("running")
     (run,) = runs()
     with crowd(run.socket, 200):
@@ -252,14 +252,14 @@ def test_stop_works_with_many_clients(background):
 
 
 def test_second_run_into_the_same_recording_is_refused(going):
-    """The recording of a run that goes on can't be taken by another."""
+    """The recording of an active run cannot be used by another."""
     path = going.parent / "experiment.yaml"
     text = hilctl("run", path, "--output", going, "--overwrite", code=2)
     assert "is recording" in text
 
 
 def test_detached_run_of_an_invalid_experiment_is_refused(tmp_path):
-    """What the foreground would refuse, the background refuses too, and leaves nothing."""
+    """It is refused as in the foreground, and no file is left."""
     path = written(tmp_path, sample_rate_hz=-1)
     text = hilctl("run", path, "--output", tmp_path / "run.mcap", "--detach", code=2)
     assert "sample_rate_hz" in text
@@ -267,7 +267,7 @@ def test_detached_run_of_an_invalid_experiment_is_refused(tmp_path):
 
 
 def test_detached_run_that_does_not_start_reports_the_same_error(tmp_path):
-    """Here a device that nothing answers for: the same error and exit code, and no recording."""
+    """A device that does not answer: the error and exit code of the foreground, no recording."""
     with socket.socket() as closed:
         closed.bind(("127.0.0.1", 0))
         port = closed.getsockname()[1]
@@ -291,7 +291,7 @@ def test_short_run_may_have_ended_when_detach_returns(tmp_path):
 
 
 def test_a_run_that_is_killed_while_it_starts_leaves_nothing(tmp_path):
-    """The next command says so in a line, and no later one does."""
+    """The next command reports it in one line, later ones do not."""
     command = [sys.executable, "-m", "hilctl", "run", str(written(tmp_path))]
     with subprocess.Popen([*command, "--output", str(tmp_path / "run.mcap")]) as process:
         deadline = time.monotonic() + 120.0
@@ -314,7 +314,7 @@ def test_without_a_run_there_is_nothing_to_stop():
 
 
 def test_short_stop_of_the_supervisor_loses_nothing(going):
-    """The ring takes what comes meanwhile."""
+    """The ring stores the samples meanwhile."""
     status = await_state("running")
     (run,) = runs()
     for number, wait_s in ((signal.SIGSTOP, 0.3), (signal.SIGCONT, 0.2)):
@@ -326,7 +326,7 @@ def test_short_stop_of_the_supervisor_loses_nothing(going):
 
 
 def test_long_run_is_complete_after_all_requests(going):
-    """After all that, it ends by its safe ramp, and every sample is there and replays."""
+    """It ends by its safe ramp, has every sample, and replays."""
     await_state("running")
     assert hilctl("stop")["ended"]
     recording = read(going)

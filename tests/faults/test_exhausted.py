@@ -1,4 +1,4 @@
-"""Guardian and supervisor without descriptors or memory: the last command must not stay."""
+"""Guardian and supervisor without descriptors or memory: the output must become safe."""
 
 import os
 import resource

@@ -1,4 +1,4 @@
-"""A command that takes a device over from a guardian, and is killed at any moment of that."""
+"""Commands that take a device over from a guardian and are killed at any moment."""
 
 import json
 import os

@@ -80,7 +80,7 @@ def test_ctrl_z_neither_suspends_a_run_nor_hides_how_to_end_it(shell, tmp_path, 
 
 @pytest.mark.parametrize("option", [pytest.param("&", marks=pytest.mark.long), "--watch &"])
 def test_a_run_in_the_background_of_the_shell_does_not_freeze(shell, tmp_path, option):
-    """Nor does it take the terminal from the shell, which still answers."""
+    """It does not take the terminal from the shell."""
     shell.type(command(option))
     first = await_state("running")
     shell.type("echo sh''ell\n")

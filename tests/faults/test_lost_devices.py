@@ -1,4 +1,4 @@
-"""A device that is gone when its loop ends: its guardian goes on, and others can relieve it."""
+"""A device that is lost when its loop ends: the guardian continues, and others can relieve it."""
 
 import json
 import os
@@ -99,7 +99,7 @@ def test_manual_safe_relieves_the_guardian_and_hands_back_an_unconfirmed_output(
 
 @pytest.mark.long
 def test_manual_safe_restarts_a_dead_guardian(abandoned):
-    """Which ``hilctl status`` lists, and ``hilctl stop`` ends."""
+    """``hilctl status`` lists it, and ``hilctl stop`` ends it."""
     (run,) = runs()
     assert signal_guardian(run, signal.SIGKILL)
     while run.alive:
@@ -194,7 +194,7 @@ def on_a_port(tmp_path, emulate, run, profile):
 
 @pytest.mark.parametrize("resumed", [False, True])
 def test_the_guardian_writes_nothing_to_another_device(on_a_port, tmp_path, profile, resumed):
-    """A link that leads to another board by now, also for a guardian started while it was gone."""
+    """If a link leads to another board, also for a guardian started while the device was lost."""
     _, port, started = on_a_port("--fault", f"unplug@{PULLED_AT}", link=True)
     assert started.end()["guardian_active"]
     if resumed:
@@ -216,7 +216,7 @@ def test_the_guardian_writes_nothing_to_another_device(on_a_port, tmp_path, prof
 
 
 def test_a_port_whose_mode_changes_meanwhile_is_the_same(on_a_port):
-    """Plugged in again, a port gets its owner and mode by udev."""
+    """udev sets owner and mode of a port that is connected again."""
     device, port, started = on_a_port(link=False)
     device.log.await_events("OUT", PULLED_AT, started.process)
     device.process.send_signal(signal.SIGSTOP)

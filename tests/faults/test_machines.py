@@ -1,4 +1,4 @@
-"""Machines with few resources, or with obstacles from other users: hilctl runs or says why not."""
+"""Machines with few resources, or with obstacles from other users: a run, or one message."""
 
 import json
 import os

@@ -52,7 +52,7 @@ def contiguous(recording):
 def test_killed_and_stopped_processes_leave_a_safe_output_and_a_whole_recording(
     action, targets, phase, stall_s
 ):
-    """Judged by the device's own log: every write is in the file, and the last is the safe one."""
+    """By the device's own log, every write is in the file, and the last is the safe value."""
     if not is_installed() and not os.environ.get("CI"):
         pytest.skip("tests/peers/node_modules is not there: run npm ci in tests/peers")
     words = [sys.executable, "-m", "tests.benchmark.kills", "--count", "1", "--json"]
@@ -65,7 +65,7 @@ def test_killed_and_stopped_processes_leave_a_safe_output_and_a_whole_recording(
 
 
 def test_loop_that_hangs_is_killed_and_the_device_made_safe(tmp_path):
-    """A loop that is stopped for good ends the run; what it had exchanged is in the file."""
+    """The exchanged samples are in the file."""
     run = begun(tmp_path)
     os.kill(run.loop, signal.SIGSTOP)
     returned, printed = run.ended()
@@ -79,7 +79,7 @@ def test_loop_that_hangs_is_killed_and_the_device_made_safe(tmp_path):
 
 
 def test_short_stop_of_the_loop_costs_no_sample(tmp_path):
-    """Below the limit the run goes on; a device with a clock of its own is caught up with."""
+    """Below the limit the run continues, and catches up with a device that has its own clock."""
     run = begun(tmp_path)
     os.kill(run.loop, signal.SIGSTOP)
     time.sleep(0.4)
@@ -96,7 +96,7 @@ def test_short_stop_of_the_loop_costs_no_sample(tmp_path):
 
 
 def test_stop_beyond_the_limit_ends_the_run(tmp_path):
-    """A loop that wakes too late takes the safe ramp, if it was not killed before."""
+    """A loop that wakes too late ramps down, if it was not killed before."""
     run = begun(tmp_path, timing={"max_late_s": 0.3})
     os.kill(run.loop, signal.SIGSTOP)
     time.sleep(0.5)
@@ -127,7 +127,7 @@ def test_silent_supervisor_ends_the_run(tmp_path):
 
 @pytest.mark.parametrize("seed", [1, 2])
 def test_run_ends_despite_garbage_in_the_ring(tmp_path, seed):
-    """Whatever is overwritten there, the run comes to an end, and its recording can be read."""
+    """The run ends and its recording is readable, whatever is overwritten."""
     run = begun(tmp_path)
     (folder,) = runs()
     chance = random.Random(seed)
@@ -145,7 +145,7 @@ def test_run_ends_despite_garbage_in_the_ring(tmp_path, seed):
 
 
 def test_death_of_both_processes_is_reported_and_recovered(tmp_path):
-    """Nobody is left to make the output safe: the next command says so, and saves the samples."""
+    """No process can make the output safe: the next command reports it and saves the samples."""
     run = begun(tmp_path)
     os.kill(run.process.pid, signal.SIGSTOP)
     time.sleep(0.3)
@@ -163,7 +163,7 @@ def test_death_of_both_processes_is_reported_and_recovered(tmp_path):
 
 
 def test_run_of_a_program_with_threads(tmp_path):
-    """In another thread than the main one, beside handlers that the program has set."""
+    """In another thread than the main one, with signal handlers of the program."""
     demo = str(ROOT / "configs" / "demo.yaml")
     code = f"""
 import signal, threading

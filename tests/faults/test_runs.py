@@ -1,4 +1,4 @@
-"""Whole runs as a user starts them, with things going wrong: one safe ramp, nothing lost."""
+"""Complete runs with faults, as a user starts them: one safe ramp, nothing lost."""
 
 import os
 import signal
@@ -42,7 +42,7 @@ def started(folder, **changes):
 
 
 def assert_good_way_out(run):
-    """The recording is complete and contiguous, ends on the ramp at the safe value, replays."""
+    """Assert that the recording is complete, ends at the safe value by the ramp, and replays."""
     recording = read(run.output)
     samples = recording.samples
     assert np.array_equal(samples.index, np.arange(samples.index.size))
@@ -97,7 +97,7 @@ def test_further_signals_do_not_skip_the_ramp(tmp_path):
     ],
 )
 def test_bad_sensor_ramps_down(tmp_path, kind, code, words):
-    """A reading that can't be trusted ends the run by its ramp."""
+    """An invalid reading ends the run by its ramp."""
     device = {**EXPERIMENT["device"], "fault": {"kind": kind, "at_sample": 9000}}
     run = started(tmp_path, device=device)
     returned, printed = run.ended()
@@ -117,7 +117,7 @@ def test_bad_sensor_ramps_down(tmp_path, kind, code, words):
 
 @pytest.mark.parametrize("kind", ["no_answer", "refused"])
 def test_device_that_fails_is_made_safe(tmp_path, kind):
-    """When exchanges fail the last resort is used, and every sample before is in the file."""
+    """The safe value is set directly, and every earlier sample is in the file."""
     device = {**EXPERIMENT["device"], "fault": {"kind": kind, "at_sample": 9000}}
     run = started(tmp_path, device=device)
     returned, printed = run.ended()
@@ -175,7 +175,7 @@ def test_run_leaves_nothing_in_memory(tmp_path):
 
 
 def test_model_exchanged_after_the_check_changes_nothing(tmp_path):
-    """What was checked is what runs, and what the recording names."""
+    """The checked files are used and recorded."""
     model = tmp_path / "model.yaml"
     model.write_text((MODELS / "terfenol_omega.yaml").read_text())
     waveform = {"kind": "sine", "unit": "um", "amplitude": 8.0, "frequency_hz": 20.0}
@@ -199,7 +199,7 @@ def supervised(folder, on_progress=lambda _: None, **changes):
 
 
 def test_the_longest_name_and_folder_are_no_error_after_the_start(tmp_path, monkeypatch):
-    """The kernel's limit for a socket's path is 107 bytes; requests reach this one all the same."""
+    """The kernel's limit for the path of a socket is 107 bytes; requests work nevertheless."""
     monkeypatch.setenv("HILCTL_RUNS", str(tmp_path / ("deep" * 20)))
     states = []
 
@@ -213,7 +213,7 @@ def test_the_longest_name_and_folder_are_no_error_after_the_start(tmp_path, monk
 
 
 def test_failing_supervisor_ends_the_run_by_its_ramp(tmp_path, monkeypatch):
-    """Coil, ring and recording are seen to, whatever is wrong; no sample is lost."""
+    """Output, ring and recording are still served; no sample is lost."""
     calls = []
 
     def alive(self):
@@ -233,7 +233,7 @@ def test_failing_supervisor_ends_the_run_by_its_ramp(tmp_path, monkeypatch):
 
 @pytest.mark.parametrize("how", ["raises", "stands still"])
 def test_failing_display_does_not_end_the_run(tmp_path, how):
-    """A terminal keeps nobody waiting."""
+    """A blocked terminal delays nothing."""
     released = threading.Event()
 
     def show(progress):
@@ -253,7 +253,7 @@ def test_failing_display_does_not_end_the_run(tmp_path, how):
 @pytest.mark.parametrize("how", ["deleted", "renamed", "truncated"])
 @pytest.mark.parametrize("on_failure", ["stop", "go_on"])
 def test_lost_recording_is_a_fault(tmp_path, how, on_failure):
-    """It ends by its safe ramp, or goes on; what the ring holds is kept."""
+    """The run ramps down or continues; the samples in the ring are kept."""
     output, moved = tmp_path / "run.mcap", tmp_path / "moved.mcap"
     done = []
 

@@ -1,4 +1,4 @@
-"""Every whole record of a damaged file, and one line on what is wrong with it; cut chunks."""
+"""Intact records of a damaged file, its damages in one line, and truncated chunks."""
 
 import io
 import struct
@@ -58,7 +58,7 @@ def test_damages_are_described_in_one_line(damages, text):
 
 
 def torn(data):
-    """An uncompressed chunk of which these bytes are there and 200 are not."""
+    """Return an uncompressed chunk with these bytes, truncated by 200."""
     return raw(chunk(data + b"\1" * 200))[:-200]
 
 
@@ -83,14 +83,14 @@ def test_a_whole_chunk_with_a_wrong_checksum_gives_nothing():
 
 
 def test_message_that_ends_in_zeros_is_discarded():
-    """What ends in zeros may have been something else before the power failed."""
+    """The zeros may have replaced other bytes when the power failed."""
     two = raw(message(1, b"\x08\x01")) + raw(message(2, b"\x08\x01"))
     records, _ = take_chunk(torn(two)[:-1] + b"\0", ReadBudget(2**20), last=True)
     assert records == [message(1, b"\x08\x01")]
 
 
 def test_a_sector_of_zeros_ends_a_compressed_stream(make):
-    """Nothing is taken from behind it: a decompressor may go on over it, with wrong numbers."""
+    """Nothing after it is used, because a decompressor could continue with wrong numbers."""
     stream = io.BytesIO()
     make.write(stream, [make.batch(0, 90, seed=3)])
     data = stream.getvalue()

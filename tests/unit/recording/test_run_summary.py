@@ -1,4 +1,4 @@
-"""Head and tail of a recording: what the whole file says of its run, and no look at its samples."""
+"""Facts from the first and last bytes of a recording, without reading its samples."""
 
 import fcntl
 import io

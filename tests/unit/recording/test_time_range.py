@@ -1,4 +1,4 @@
-"""A stretch of a run: what would be seen of the whole between two times, in less memory."""
+"""A time range of a run: the same as a part of the whole, with less memory."""
 
 import io
 import struct

@@ -1,4 +1,4 @@
-"""What facts and messages of a recording must be; a file that holds others is refused by a line."""
+"""Rules for facts and messages of recordings; violations are refused with one message."""
 
 import io
 import json
@@ -27,7 +27,7 @@ FADE = NO_SLOPE | {"slope": 0.1}
 
 @pytest.fixture
 def crafted(tmp_path, make):
-    """Write a recording whose records have gone through a function, with right checksums."""
+    """Write a recording whose records are changed by a function, with correct checksums."""
 
     def write(change):
         sound = io.BytesIO()
@@ -236,7 +236,7 @@ def test_impossible_segments_are_refused(change):
 
 
 def test_tolerated_deviations_from_the_format():
-    """A period may be left out, or be whole, and a label may hold a tab."""
+    """A period may be omitted or a whole number, and a label may contain a tab."""
     odd = {**GOOD, "period": 20, "label": "sine\t"}
     assert validation.segments_of(json.dumps([odd])) == (Segment("sine\t", 0, 100, 10, 90, 20.0),)
     del odd["period"]

@@ -1,4 +1,4 @@
-"""What is written can be read by what it is said to be."""
+"""Writing of recordings: events, replay starts, failing disks."""
 
 import errno
 import os
@@ -23,7 +23,7 @@ def test_event_has_its_values_and_time(tmp_path, make):
 
 
 def test_half_a_character_is_escaped(tmp_path):
-    """An event or an outcome may hold the text of any error."""
+    """An event or an outcome may contain the text of any error."""
     text, escaped = "no answer: \ud800", r"no answer: \ud800"
     events = [Event(100, "warning", "noted", text)]
     assert read(written(tmp_path / "run.mcap", [], events=events)).events[0].text == escaped
@@ -42,7 +42,7 @@ def test_replay_can_start_first_and_after_each_gap(recorded):
     ("overwrite", "said"), [(True, "Not a regular file"), (False, "File exists")]
 )
 def test_recording_to_a_pipe_is_refused(tmp_path, overwrite, said):
-    """Opened, it would wait for a reader for ever, or lose what is written."""
+    """It would block until a reader opens it, or lose data."""
     os.mkfifo(tmp_path / "run.mcap")
     with pytest.raises(OSError, match=said):
         OutputFile(tmp_path / "run.mcap", overwrite=overwrite)
@@ -50,7 +50,7 @@ def test_recording_to_a_pipe_is_refused(tmp_path, overwrite, said):
 
 @pytest.fixture
 def pending(tmp_path):
-    """A file that keeps what it could not write, and the disk below it."""
+    """A file that keeps unwritten bytes, and its disk."""
     path = tmp_path / "run.mcap"
     path.touch()
     with FailingFile(path) as disk:
@@ -122,7 +122,7 @@ def test_renamed_file_is_completed_when_its_name_is_back(pending):
 
 
 class LossyDisk:
-    """``os.fsync`` of a disk that loses, once, what it was not yet asked to keep."""
+    """``os.fsync`` of a disk that once loses the bytes since the last sync."""
 
     def __init__(self, path):
         self.path, self.kept, self.fails = path, 0, False
@@ -154,7 +154,7 @@ def test_bytes_that_a_failed_sync_lost_are_written_again(pending, monkeypatch):
 
 
 def test_bytes_that_are_not_in_memory_cannot_be_rewritten(pending, monkeypatch):
-    """The kernel reports it once: a later sync that succeeds must not hide it."""
+    """The kernel reports the error once; a later successful sync must not hide it."""
     file, _, path = pending
     monkeypatch.setattr(os, "fsync", lossy := LossyDisk(path))
     file.write(b"first")

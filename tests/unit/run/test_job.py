@@ -1,4 +1,4 @@
-"""The job: the loop process gets the experiment that was checked, to the last bit."""
+"""The job: the loop process gets exactly the checked experiment."""
 
 import math
 import shutil
@@ -28,7 +28,7 @@ def folder(tmp_path):
 
 
 def test_job_contains_the_checked_files(folder, tmp_path):
-    """Between the check and the start a model file may change: the run is the checked one."""
+    """A model file may change between check and start; the checked one is used."""
     shutil.copytree(CONFIGS, tmp_path / "configs")
     (tmp_path / "link").symlink_to("configs")
     checked = checked_experiment(tmp_path / "link/demo.yaml", ["waveform.duration_s=1.0"])

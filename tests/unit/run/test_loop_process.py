@@ -1,4 +1,4 @@
-"""The loop process, run in this one: what it does with a job, and what it imports."""
+"""The loop process, executed in this one: its job, its errors and its imports."""
 
 import os
 import signal
@@ -57,7 +57,7 @@ class Closing:
 
 
 class Prepared:
-    """A job with everything it needs, a device that notes what is asked of it, and the page."""
+    """A job with its files, a device that records its calls, and the page."""
 
     def __init__(self, folder, monkeypatch, **device_is):
         checked = checked_experiment(EXPERIMENT, ["waveform.duration_s=1.0"])
@@ -127,7 +127,7 @@ def test_cause_is_reported_even_if_the_device_does_not_answer(broken):
 
 @pytest.mark.parametrize("output", [None, 99.0])
 def test_a_start_that_is_refused_moves_nothing(broken, output):
-    """Not to the safe value either, which would be the jump that the refusal is to spare."""
+    """Also not to the safe value, which would be the jump that the refusal prevents."""
     device, error, page = broken(output=output)
     assert device.events == ["prepare", "open", "close"]
     assert isinstance(error, InputError)
@@ -160,7 +160,7 @@ def test_real_time_that_is_required_is_refused_before_the_device_is_opened(prepa
     (PageField.GO, ["prepare", "open", "close"]),
 ])  # fmt: skip
 def test_if_the_supervisor_dies_before_the_start_nothing_moves(prepared, monkeypatch, field, done):
-    """There is no recording that could say so; the output stays where it was found."""
+    """The output keeps its initial value."""
     made = prepared()
     made.page.put(field, 0)
     monkeypatch.setattr("hilctl.run.loop_process.RingHost.supervised", lambda host: False)
@@ -218,9 +218,9 @@ def test_a_loop_ends_if_its_output_needs_no_guardian(orphaned, monkeypatch, why)
 def test_outcome_and_errors_are_in_the_shared_page(
     prepared, monkeypatch, raised, code, phase, text
 ):
-    """The supervisor tells by the phase what is there: an outcome, a refusal, or a fault.
+    """The phase tells an outcome from a refusal and a fault.
 
-    A stop comes from the supervisor alone, so that the loop ends by the ramp.
+    Signals are ignored: only the supervisor stops the loop, by its ramp.
     """
     made, signals, done = prepared(), {}, []
 
@@ -276,7 +276,7 @@ def clock():
 
 @pytest.fixture
 def host(ring, clock, monkeypatch):
-    """A host whose supervisor is process 77 and shows life at once."""
+    """A host whose supervisor is process 77 and has just given a heartbeat."""
     monkeypatch.setattr("os.getppid", lambda: 77)
     ring.page.put(PageField.SUPERVISOR_HEARTBEAT_NS, clock.now)
     return RingHost([ring], clock, 77, SILENCE_S)
@@ -340,7 +340,7 @@ class AskingDevice(FakeDevice):
 
 
 class Rig:
-    """A loop on a ring, whose supervisor is this process' parent; it goes round several times."""
+    """A loop on a ring that wraps around several times; the supervisor is the parent process."""
 
     SLOTS = 16
     SAMPLES = 84

@@ -1,4 +1,4 @@
-"""What a recording says of its run."""
+"""Metadata of a run in its recording."""
 
 import hashlib
 import json
@@ -129,7 +129,7 @@ LONG = (Segment("less than a cycle", 0, 6000, 0, 6000, 9000.0),)
 
 
 def gathered(recording, pieces=7, events=()):
-    """Return the facts that come of a recording's samples, a few at a time."""
+    """Return the facts from the samples of a recording, in pieces."""
     figures = EndFigures(recording.segments, compensated=recording.compensated)
     rows = recording.samples.index.size
     bounds = np.linspace(0, rows, pieces + 1).astype(int)
@@ -141,7 +141,7 @@ def gathered(recording, pieces=7, events=()):
 
 
 def reported(recording):
-    """Return the same figures of a report, without those that it has not."""
+    """Return the same metrics of a report, except missing ones."""
     report = summarize(recording).to_mapping()
     return {name: report[name] for name in END_FIGURES if report[name] is not None}
 
@@ -180,7 +180,7 @@ def test_tuned_segment_has_no_metrics(at, takes, counts):
 
 
 def test_samples_of_the_ramp_belong_to_no_segment():
-    """A run that is stopped goes on to the safe value, past where its segment would have ended."""
+    """A stopped run ramps to the safe value within the times of its segment."""
     recording = read(GOLDEN / "terfenol_compensated.mcap")
     samples = recording.samples
     samples.flags[samples.index >= 4000] |= Flag.RAMP.value

@@ -1,4 +1,4 @@
-"""Probing a device: it is only read, nobody else may use it, and what it says is judged."""
+"""Probing a device: it is only read, and its answers are evaluated."""
 
 import math
 import re
@@ -73,7 +73,7 @@ class ProbedRig:
         self.experiment.write_text(yaml.safe_dump(section), encoding="utf-8")
 
     def drive(self, command):
-        """Put out a command and die: nothing is disarmed or closed."""
+        """Apply a command and crash: nothing is disarmed or closed."""
         chosen = device_class(self.device["kind"])
         section = {key: value for key, value in self.device.items() if key != "kind"}
         device = chosen(chosen.Options.model_validate(section))
@@ -142,7 +142,7 @@ def test_a_measured_output_is_read_too(rig):
 
 @pytest.mark.parametrize("query", ["readback", "error_query"])
 def test_a_wrong_query_of_the_output_is_found(rig, query):
-    """A run asks it last."""
+    """A run sends this query only at its end."""
     probed = rig("kepco_bop", reader="agilent_34970a", measure="current")
     profile = Path(probed.device["profile"])
     data = yaml.safe_load(profile.read_text(encoding="utf-8"))
@@ -171,7 +171,7 @@ def test_a_wrong_word_order_is_found(rig):
 
 
 def test_a_device_that_a_run_holds_is_not_disturbed(rig):
-    """Many devices take one connection only: the run would lose it."""
+    """Many devices accept only one connection, which the run would lose."""
     probed = rig("labjack_t7")
     place = f"tcp:127.0.0.1:{probed.device['tcp_port']}"
     with held_devices([place]), pytest.raises(InputError, match="in use"):

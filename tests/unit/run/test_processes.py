@@ -22,7 +22,7 @@ HOLDS = f"tcp:10.9.8.7:{os.getpid()}"  # locks are the whole machine's
 
 
 class FakeProcess:
-    """A process that has ended with a code, or lives where that is None."""
+    """A process that has ended with a code, or is alive if that is None."""
 
     code = None
 
@@ -171,7 +171,7 @@ def test_relieved_runs_with_unrecorded_samples_are_kept(left):
     lambda page: page.put(PageField.GO, 0),
 ], ids=["guardian ended", "loop ended", "never started"])  # fmt: skip
 def test_a_run_whose_output_is_safe_needs_no_relief(left, settle):
-    """Such as one whose samples wait for room on the disk."""
+    """For example, if only its samples are not yet recorded."""
     _, page = left(guarded=False, recorded=False)
     settle(page)
     assert not GuardianRelief([HOLDS]).found

@@ -35,7 +35,7 @@ END = {"code": "completed", "reason": "waveform completed"}
 
 
 def batch(first, blocks, dropped=0):
-    """Return blocks that follow one another, the first behind a gap of ``dropped`` samples."""
+    """Return consecutive blocks, the first after a gap of ``dropped`` samples."""
     made = BlockBatch.empty(blocks, BLOCK, 3)
     made.heads[:, BlockHeader.FIRST_SAMPLE] = first + BLOCK * np.arange(blocks)
     made.heads[:, BlockHeader.SAMPLES] = BLOCK
@@ -46,7 +46,7 @@ def batch(first, blocks, dropped=0):
 
 @pytest.fixture(scope="module")
 def checked():
-    """An experiment that may start."""
+    """A checked experiment."""
     return checked_experiment(EXPERIMENT, [])
 
 
@@ -130,7 +130,7 @@ def test_failed_sync_at_the_end_is_an_error(begun, monkeypatch):
 
 
 def test_the_state_of_the_device_names_the_run_and_how_it_ended(checked, tmp_path):
-    """From its beginning on: a run that is killed must not leave the device to the one before."""
+    """From its start: the state must not be that of the run before if this one is killed."""
     device = checked.loaded.device
     info = replace(device.info, holds=("tcp:10.0.0.5:502",), output="7:DAC1")
     real = SimpleNamespace(info=info)
@@ -228,7 +228,7 @@ def test_no_recent_samples_before_the_first_one():
 
 @pytest.fixture
 def on_a_disk(checked, tmp_path):
-    """A recorder in a folder that may go."""
+    """A recorder in a folder that can be removed."""
     folder = tmp_path / "disk"
     folder.mkdir()
     return Recorder(checked, folder / "run.mcap", overwrite=False)
@@ -272,7 +272,7 @@ ENDED = LoopOutcome("completed", "waveform completed", 8, "confirmed", 0)
 
 
 class RecorderDouble:
-    """Keeps what it is given; a flush waits for ``disk``."""
+    """Records its arguments; a flush waits for ``disk``."""
 
     def __init__(self):
         self.firsts, self.events, self.finished, self.errors = [], [], None, []
@@ -317,7 +317,7 @@ def ring(tmp_path):
 
 @pytest.fixture
 def recording(ring):
-    """A recording of a ring; it is not started, so that a test says what it does when."""
+    """A recording of a ring that is not started: the test calls each step."""
     return RingRecorder(ring, RecorderDouble(), flush_s=0.0)
 
 

@@ -27,7 +27,7 @@ GOLDEN = Path(__file__).parents[3] / "recordings" / "golden" / "terfenol_uncompe
 
 @pytest.fixture
 def dead(tmp_path):
-    """Leave the folder of a dead run behind; yield a function that does, given its ring.
+    """Return a function that leaves the folder of a dead run with a given ring.
 
     With a list for ``guardian`` its lock is held until the test closes the descriptor in it.
     """
@@ -74,7 +74,7 @@ def test_outcome_of_a_loop_that_ramped_down_counts(dead):
     ("error", "words"), [("", "confirmed by the device"), ("no answer", "no answer")]
 )
 def test_recovery_reports_the_action_of_the_guardian(dead, error, words):
-    """Both others were dead; what it could not confirm is not called safe."""
+    """Supervisor and loop were dead; an unconfirmed output is not safe."""
 
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
@@ -100,7 +100,7 @@ def page_of(run):
 
 
 def unsafe(folder):
-    """Leave a guardian that has not yet reached the device."""
+    """Leave a ring whose guardian has not yet reached the device."""
     page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
     page.put(PageField.PHASE, Phase.RUNNING)
     page.put(PageField.GO, 1)

@@ -162,7 +162,7 @@ def test_run_is_not_dead_while_its_folder_is_removed(tmp_path, monkeypatch):
 
 
 def test_folder_of_a_dead_process_with_the_same_id_is_kept(tmp_path):
-    """A new run takes another folder: the old one's ring may be all there is of its samples."""
+    """A new run has another folder: the old ring may have unrecorded samples."""
     old = base_folder() / f"sine-{os.getpid()}"
     old.mkdir()
     (old / "ring").write_text("samples")
@@ -264,7 +264,7 @@ def test_holder_without_a_run_is_named_by_the_kernel():
 
 @pytest.fixture
 def squatted(monkeypatch):
-    """A resource whose name a socket of another user has bound, and the socket."""
+    """A resource whose name is bound by a socket of another user, and the socket."""
     name = f"{NAME}squatted"
     asked = run_folder_module._holder
     monkeypatch.setattr(

@@ -1,4 +1,4 @@
-"""Repeats of runs: after a stall only, and only if the output is known."""
+"""Repeats of runs: only after a stall, and only if the output is known."""
 
 from pathlib import Path
 from types import SimpleNamespace

@@ -109,7 +109,7 @@ GIVEN = ("x.yaml", (), None, False, 0.0, False)
 
 @pytest.fixture
 def answering(monkeypatch):
-    """Return a function that says what the process of a run does, in Python."""
+    """Return a function that sets the Python program of a run's process."""
 
     def says(code):
         first = "import os, pickle, signal, sys; answers = os.fdopen(int(sys.argv[1]), 'wb')"

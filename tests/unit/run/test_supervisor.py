@@ -1,4 +1,4 @@
-"""What the supervisor's main thread does with a run, its progress and the service manager.
+"""The supervisor's main thread: monitoring of a run, progress, systemd.
 
 Starts, signals and results are tested by complete runs in ``tests/faults``.
 """
@@ -90,7 +90,7 @@ def test_a_signal_has_priority_over_an_error_of_the_supervisor(run, number, stop
 
 
 def test_outcome_of_the_loop_counts_after_its_process_has_ended(run):
-    """Until then it may still be closing its device."""
+    """Before, it may still be closing its device."""
     outcome = LoopOutcome("completed", "waveform completed", 7, "confirmed", 0)
     run.page.leave_outcome(outcome)
     run.started.poll(0)
@@ -132,7 +132,7 @@ def test_outcome_names_the_process_that_acted_and_the_state_of_the_output(run, r
 def test_outcome_of_a_slow_exchange_names_the_limit(
     tmp_path, monkeypatch, exchanging, silent_ms, simulated, slow
 ):
-    """The silence is that before the kill: the ramp to the safe value may take long."""
+    """The silence before the kill counts, without the ramp to the safe value."""
     run, now = Run(tmp_path, simulated=simulated), ManualClock()
     monkeypatch.setattr(module, "time", SimpleNamespace(monotonic_ns=now))
     run.page.put(PageField.LOOP_HEARTBEAT_NS, now.now_ns)

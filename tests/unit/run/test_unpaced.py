@@ -1,4 +1,4 @@
-"""A run as fast as it goes: blocks in whole batches, virtual time, and only on simulations."""
+"""Runs without real time: batches of blocks, virtual time, simulated devices only."""
 
 import errno
 from dataclasses import replace
@@ -176,7 +176,7 @@ def test_run_in_memory_equals_the_recorded_run(tmp_path):
 
 @pytest.mark.parametrize("name", ["terfenol_sine_6a_uncompensated", "terfenol_sine_6a"])
 def test_end_of_a_recording_has_the_metrics_of_the_report(tmp_path, name):
-    """As a report does, so that nobody has to read the samples for it."""
+    """They can be read without the samples."""
     soft = [f"waveform.soft_{end}_s=0.05" for end in ("start", "end")]
     checked = checked_experiment(UNCOMPENSATED.with_stem(name), [*SHORT, *soft])
     recording = read(run_unpaced(checked, tmp_path / "run.mcap").path)

@@ -37,7 +37,7 @@ def run(name, *, supervised=True, alive=True, recorded=False):
 
 @pytest.fixture
 def going(monkeypatch):
-    """Let these runs be active."""
+    """Return a function that makes runs active."""
     return lambda *names: monkeypatch.setattr(client, "runs", lambda: [run(n) for n in names])
 
 
@@ -165,7 +165,7 @@ def test_a_dropped_request_is_sent_again(tmp_path):
 
 @pytest.fixture
 def process():
-    """A process that ends by the first signal that comes."""
+    """A process that ends at the first signal."""
     # What this process ignores, its children do too, until they say otherwise.
     code = (
         f"import signal; signal.signal({STOP_SIGNAL}, signal.SIG_DFL); print(flush=True); input()"
@@ -191,13 +191,13 @@ def test_the_supervisor_gets_the_signal(process):
 
 
 def test_a_process_that_holds_no_lock_is_left_alone(process):
-    """Its number may be another program's by now."""
+    """Another program may have its process id."""
     assert not request_stop(run_of(process.pid, supervised=False))
     assert process.poll() is None
 
 
 def test_lock_is_checked_after_the_process_is_opened(process, monkeypatch):
-    """The other way round, the number could become another's in between."""
+    """In the other order, the process id could be reused in between."""
     order = []
     opened = os.pidfd_open
 
@@ -223,7 +223,7 @@ def test_a_supervisor_that_is_gone_is_no_error(process):
 
 @pytest.fixture
 def recovered(monkeypatch):
-    """Return a function that finishes the dead ones of runs, each of which becomes a result."""
+    """Return a function that recovers dead runs with a given result."""
 
     def finish(result, *found):
         monkeypatch.setattr("hilctl.run.recovery.recover_dead_runs", lambda: [result])

@@ -81,7 +81,7 @@ def test_status_has_state_sample_and_gain(requests, page):
 
 
 def test_socket_accepts_no_stop(requests):
-    """Others may keep it busy: a stop has a signal of its own."""
+    """Other clients could block it; a stop is a signal."""
     with pytest.raises(InputError, match="one of"):
         asked(requests, command="stop")
 
@@ -140,7 +140,7 @@ def test_a_mark_that_would_be_lost_is_refused(requests, recording):
 
 
 def test_the_protocol_names_every_request():
-    """What a client may send by it is what is read here."""
+    """The client and the supervisor know the same requests."""
     schema = REQUESTS.json_schema()
     assert {*schema["discriminator"]["mapping"]} == {*get_args(client.Command)}
     assert client.request("set", gain=0.5, offset=None) == {"command": "set", "gain": 0.5}
@@ -217,7 +217,7 @@ def change(changes, gain=None, offset=None, over_s=0.2, inverse=None):
 
 
 def take(page, at):
-    """Let the loop take the change on the page, at a sample."""
+    """Take the change on the page at a sample, as the loop does."""
     page.put(PageField.NEXT_SAMPLE, at)
     page.put(PageField.TUNE_TAKEN, page.get(PageField.TUNE_WANTED))
 
@@ -278,7 +278,7 @@ def test_the_end_of_the_run_refuses_a_change_that_waits(changes, page, waits, nu
 
 
 def test_waiting_for_a_loop_that_takes_no_change_has_a_limit(changes, waits):
-    """The client would have given up."""
+    """The client has a shorter timeout."""
     change(changes, gain=0.1)
     with pytest.raises(InputError, match="previous change"):
         change(changes, gain=0.2)
@@ -461,7 +461,7 @@ def test_only_its_owner_may_use_it(server, tmp_path):
 
 
 def test_it_listens_again_after_its_folder_was_removed(tmp_path):
-    """As at a log-out; but not in a folder that others can write to."""
+    """As after a logout, except in a folder that others can write to."""
     path = tmp_path / "runs" / "sine-7" / "socket"
     path.parent.mkdir(parents=True, mode=0o700)
     path.parent.parent.chmod(0o700)

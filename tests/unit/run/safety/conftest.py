@@ -1,4 +1,4 @@
-"""A reserve that is never held: each action has a thread of its own, and tests keep their input."""
+"""A reserve that is never held: each action has its own thread, and tests keep their input."""
 
 import pytest
 

@@ -1,4 +1,4 @@
-"""The guardian: what it takes for a dead or hanging loop, and what it does then."""
+"""The guardian: detection of a dead or hanging loop, and its safe action."""
 
 import fcntl
 import os
@@ -59,7 +59,7 @@ def job_of(experiment, *, ring="", limits=JOB_LIMITS, locks=(), take_over=False)
 
 
 class Device:
-    """Notes what it is asked for, and whether the loop was left to live then."""
+    """Records each safe value, and whether the loop was alive at that time."""
 
     def __init__(self, loop, error=None):
         self.loop, self.error, self.asked = loop, error, []
@@ -76,7 +76,7 @@ class Device:
 
 @contextmanager
 def ended_after(device, calls):
-    """Have the user end the guardian in a call of its device; wait for its thread afterwards."""
+    """End the guardian in a given call of its device; wait for its thread afterwards."""
     make_safe, made = device.make_safe, []
 
     def ending(value):
@@ -95,7 +95,7 @@ def ended_after(device, calls):
 
 @pytest.fixture
 def guarded(tmp_path):
-    """A process that stands for the loop, and a function that guards it until it is gone."""
+    """A process in place of the loop, and a function that guards it to its end."""
     loop = subprocess.Popen(SLEEP)
     ring = SampleRing.create(tmp_path / "ring", slots=4, block=1, state_size=1)
     page = ring.page
@@ -144,7 +144,7 @@ def test_safe_value_is_set_after_a_loop_that_died_or_failed(guarded, left):
 
 @pytest.mark.parametrize("output", ["unknown", "set"])
 def test_guardian_continues_after_an_unconfirmed_output(guarded, output):
-    """A command of the loop may still be executed, so that only the user ends the guardian."""
+    """A command of the loop may still be executed; only the user ends the guardian."""
     gave_up(guarded.page, output)
     guarded.loop.kill()
     with ended_after(guarded.device, calls=3):
@@ -155,7 +155,7 @@ def test_guardian_continues_after_an_unconfirmed_output(guarded, output):
 
 @pytest.mark.parametrize("how", ["stopped", "silent"])
 def test_a_loop_that_hangs_is_killed_before_the_device_is_touched(guarded, how):
-    """A stopped one in the midst of an exchange too: nothing of it may come after."""
+    """Also a loop that is stopped in an exchange: none of its commands may follow."""
     guarded.page.put(PageField.LOOP_HEARTBEAT_NS, 1)
     if how == "stopped":
         guarded.page.put(PageField.EXCHANGING, 1)
@@ -169,7 +169,7 @@ def test_a_loop_that_hangs_is_killed_before_the_device_is_touched(guarded, how):
 
 
 def test_killed_loop_may_finish_a_call_before_the_device_is_touched(guarded, monkeypatch):
-    """The kernel ends it, where it is not held up: a device may take one connection only."""
+    """The kernel usually ends the call; a device may accept only one connection."""
     done = []
 
     class Death:
@@ -227,7 +227,7 @@ def test_guardian_ramps_from_the_last_command(guarded):
 
 
 def test_guardian_continues_the_ramp_of_another_process(guarded):
-    """It would step back to the last command otherwise."""
+    """Otherwise the output would step back to the last command."""
     guarded.page.put_float(PageField.OUTPUT_AT_START, 4.0)
     guarded.page.note_safe_write(0.3)
     guarded.loop.kill()
@@ -247,7 +247,7 @@ def test_guardian_keeps_trying_until_the_user_ends_it(guarded):
 
 @pytest.mark.parametrize("error", [MemoryError(), ZeroDivisionError("a bug")])
 def test_guardian_that_cannot_drive_the_device_reports_it_and_retries(guarded, monkeypatch, error):
-    """The supervisor drives the device then, unless it has died too."""
+    """The supervisor then drives the device, unless it has died too."""
     monkeypatch.setattr(guardian, "_AGAIN_S", 0.0)
     said, write_text = [], guarded.page.write_text
 
@@ -367,7 +367,7 @@ def test_guardian_waits_while_the_supervisor_acts(guarded, monkeypatch):
 
 
 def test_guardian_gives_heartbeats_while_the_device_blocks(guarded, monkeypatch):
-    """The supervisor would take it for dead otherwise, and reach for the device as well."""
+    """Otherwise the supervisor would replace it and drive the device too."""
     go_on, seen = threading.Event(), set()
 
     class Prompt(SafeAction):
@@ -427,7 +427,7 @@ def test_the_device_is_made_of_the_experiment_alone():
 
 @pytest.mark.parametrize("limit", [None, 65536])
 def test_guardian_prepares_its_process_for_real_time(written, guarded, monkeypatch, limit):
-    """No signal ends it, it stays in memory where it may, and both threads are quick."""
+    """It ignores signals, locks its memory if permitted, and both threads have priority."""
     done, descriptors = [], set(DESCRIPTORS.iterdir())
     process = SimpleNamespace(
         freeze_gc=lambda: done.append("frozen"),
@@ -472,7 +472,7 @@ LIMITS = SilenceLimits(real_time_s=1.0, ordinary_s=1.6, exchange_s=2.0, stopped_
 
 
 class Watched:
-    """A page with a heartbeat, and who watches it."""
+    """A page with a heartbeat, and its watch."""
 
     def __init__(self, folder):
         self.page = SampleRing.create(folder / "ring", slots=4, block=1, state_size=1).page
@@ -526,7 +526,7 @@ def test_heartbeat_restarts_the_time(watched):
 
 
 def test_suspended_machine_is_no_hang(watched):
-    """Not even late between two slow ticks, after many looks at the same heartbeat."""
+    """Even between two slow ticks, after many looks at the same heartbeat."""
     assert not any(watched.looks(*[0.01 * k for k in range(10)], 30.0, 30.02))
 
 
@@ -538,14 +538,14 @@ def test_loop_before_its_start_or_after_its_end_does_not_hang(watched):
 
 
 def test_stopped_loop_is_checked_several_times(watched):
-    """Where all processes were stopped and go on, this one may be the first of them."""
+    """If all processes were stopped, this one may be the first to continue."""
     watched.stopped = True
     assert not any(watched.looks(0.0, *[5.0 + 0.01 * k for k in range(39)]))
     assert watched.looks(5.4, 5.41)[-1]
 
 
 def test_loop_without_a_first_tick_is_detected(watched):
-    """Nothing has moved until then, so that it gets more time: from the first look on."""
+    """Nothing has moved, so it has more time, counted from the first look."""
     watched.page.put(PageField.LOOP_HEARTBEAT_NS, 0)
     assert not any(watched.looks(*[9e5 + 0.01 * k for k in range(3100)]))
     assert watched.looks(*[9e5 + 31.0 + 0.01 * k for k in range(5)])[-1]

@@ -1,4 +1,4 @@
-"""A device put at its safe value by hand: confirmed, not confirmed, or refused."""
+"""``hilctl safe``: output confirmed, not confirmed, or refused."""
 
 from dataclasses import replace
 from unittest.mock import Mock
@@ -13,7 +13,7 @@ from tests.fakes import held_devices
 
 
 class Amplifier(SimulatedTerfenol):
-    """A device that notes what it is asked for, and has a port that one may hold."""
+    """A device that records its safe values, and has a port that can be locked."""
 
     asked: list
     error = ""
@@ -47,7 +47,7 @@ def amplifier(monkeypatch):
 
 @pytest.fixture
 def experiment(tmp_path):
-    """A file whose model is gone, which is no reason to leave a coil as it is."""
+    """An experiment without its model file, which the safe value does not need."""
     path = tmp_path / "experiment.yaml"
     section = {"kind": "simulated_terfenol"}
     given = {"device": section, "safe": {"value": 0.5}, "compensator": {"model": "gone.yaml"}}

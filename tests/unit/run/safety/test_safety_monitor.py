@@ -1,4 +1,4 @@
-"""Who makes the output safe: the guardian where it can, the supervisor where it can't."""
+"""Choice of the process that makes the output safe: the guardian, otherwise the supervisor."""
 
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -21,7 +21,7 @@ MS = 1_000_000
 
 
 class Guardian:
-    """A guardian whose process and signs of life the test has in its hand."""
+    """A guardian whose process and heartbeat are set by the test."""
 
     def __init__(self, page, log):
         self.page, self.log, self.ended, self.error = page, log, False, "no device"
@@ -40,7 +40,7 @@ class Guardian:
 
 
 class Run:
-    """A run's safety, with time in the test's hand."""
+    """The safety monitor of a run, with a clock of the test."""
 
     def __init__(self, ring, monkeypatch, *, guarded=True, simulated=False):
         page = ring.page
@@ -90,12 +90,12 @@ class Run:
         self.safety.update(self.now_ns, ended=ended)
 
     def look_alive(self, page, passed_ms):
-        """Look at a loop that has just given a sign of life; the guardian gives none."""
+        """Update with a new heartbeat of the loop, and none of the guardian."""
         page.put(PageField.LOOP_HEARTBEAT_NS, self.now_ns + round(passed_ms * MS))
         self.look(passed_ms=passed_ms, awake=False)
 
     def settle(self):
-        """Look until what has been begun is over."""
+        """Update until there is a result."""
         while self.safety.result is None:
             self.look(ended=True, awake=False)
         return self.safety.result
@@ -136,7 +136,7 @@ def test_responsive_guardian_acts(run, page):
 
 @pytest.mark.parametrize("what", ["dead", "silent", "starting"])
 def test_supervisor_acts_if_the_guardian_cannot(run, what):
-    """It kills the other one first: no two of them may hold the device."""
+    """It first kills the guardian, because only one may drive the device."""
     guardian = run.guardians[0]
     run.look()
     guardian.ended = what == "dead"
@@ -182,7 +182,7 @@ def test_guardian_that_keeps_trying_is_not_replaced(run, page):
 
 @pytest.mark.parametrize("phase", [GuardianPhase.FAILED, GuardianPhase.ACTING])
 def test_if_the_guardian_fails_the_supervisor_drives_the_device(run, page, phase):
-    """It may lack memory or descriptors, which is no answer of the device."""
+    """It may lack memory or descriptors, which says nothing about the device."""
     acting(run, page, output="unknown", error="no answer")
     run.look(ended=True)
     run.guardians[0].phase, run.guardians[0].ended = phase, True

@@ -32,7 +32,7 @@ def born(ring, number, *, due=True):
 
 
 def push(ring, number):
-    """Let a block be born, sent and answered at once; return whether it has a slot."""
+    """Fill, send and answer a block; return whether it has a slot."""
     return ring.answered(born(ring, number))
 
 
@@ -121,7 +121,7 @@ def test_damaged_slot_is_skipped(tmp_path):
     (BlockHeader.LATE_NS, -LONGEST_NS - 1),
 ])  # fmt: skip
 def test_slot_with_impossible_numbers_is_skipped(tmp_path, field, value):
-    """Recorded, it would keep all the rest from being read."""
+    """Once recorded, it would make the rest unreadable."""
     ring = make(tmp_path)
     for number in range(3):
         push(ring, number)

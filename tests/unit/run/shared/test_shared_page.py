@@ -86,7 +86,7 @@ def test_notes_are_read_by_all_and_the_oldest_are_dropped(sides):
 
 
 def test_resource_usage_is_shared(sides):
-    """Nothing is known of a loop that died before it could say it."""
+    """The usage of a loop that died early is unknown."""
     one, other = sides
     assert other.usage() is None
     usage = ProcessUsage(98_000_000, 1_500, 12, 3, 4)
