@@ -2,7 +2,7 @@
 
 from collections.abc import Mapping
 from dataclasses import dataclass
-from typing import Any, TypeAlias
+from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
 from scipy.linalg import qr
@@ -135,6 +135,23 @@ def _held(data: FitData, plays: int) -> F64:
     return longest * np.column_stack([np.zeros(len(weights)), weights])
 
 
+class PublishedNames(NamedTuple):
+    """Names of the parameters of a kind of model in its publication."""
+
+    spacing: str
+    factor: str  # of exponential weights
+    decay: str
+    weight: str  # followed by _ and the number of a play
+
+
+_PPI_NAMES = PublishedNames("sigma", "alpha", "beta", "p")  # (3.25-3.27)
+NAMES: Mapping[str, PublishedNames] = {
+    "ppi": _PPI_NAMES,
+    "spi": _PPI_NAMES,
+    "rdpi": PublishedNames("alpha", "alpha_0", "beta_0", "a"),  # (5.11, 5.14)
+}
+
+
 class PlaysProblem:
     """Fit a PPI (3.25-3.27) or an RDPI (5.11, 5.14).
 
@@ -151,13 +168,14 @@ class PlaysProblem:
 
     def __init__(self, data: FitData, settings: FitSettings) -> None:
         self._data, self._settings = data, settings
+        self._names = NAMES[settings.kind]
         self._rate_dependent = settings.kind == "rdpi"
         self._exponential = settings.weights == "exponential"
-        space = {"alpha" if self._rate_dependent else "sigma": (0.05, 1.0, 0.8)}
+        space = {self._names.spacing: (0.05, 1.0, 0.8)}
         if self._rate_dependent:
             space["gamma"] = (0.0, 1.0, 0.1)
         if self._exponential:
-            space["beta_0" if self._rate_dependent else "beta"] = (0.0, 40.0, 1.5)
+            space[self._names.decay] = (0.0, 40.0, 1.5)
         self.space = SearchSpace.of(space)
         size = data.target_um.size
         free = np.ones((size, 1)) if settings.offset else np.empty((size, 0))
@@ -213,17 +231,14 @@ class PlaysProblem:
     def parameters(self, x: F64, scale: F64) -> dict[str, float]:
         """Return the fitted parameters under their published names."""
         found, free = self._solve(self._columns(x), scale)
-        alpha, beta, a = (
-            ("alpha", "beta_0", "a") if self._rate_dependent else ("sigma", "beta", "p")
-        )
-        out = {alpha: self._spacing(x), f"{a}_0": float(found[0])}
-        if self._rate_dependent:
-            out["gamma"] = self._growth_s(x)
+        names = self._names
+        out = {names.spacing: self._spacing(x)}
+        out |= {"gamma": self._growth_s(x)} if self._rate_dependent else {}
         if self._exponential:
-            out["alpha_0" if self._rate_dependent else "alpha"] = float(found[1])
-            out[beta] = self._beta(x)
+            out |= {f"{names.weight}_0": float(found[0])}
+            out |= {names.factor: float(found[1]), names.decay: self._beta(x)}
         else:
-            out |= {f"{a}_{i}": float(weight) for i, weight in enumerate(found[1:], start=1)}
+            out |= {f"{names.weight}_{i}": float(weight) for i, weight in enumerate(found)}
         return out | ({"output_offset_um": self._offset_um(free)} if free.size else {})
 
     def _solve(self, columns: F64, scale: F64) -> tuple[F64, F64]:
