@@ -118,51 +118,6 @@ def _rest(cell: int, lowest: float, width: float) -> float:
     return min(max(-(lowest + cell * width), 0.0), width)
 
 
-@kernel(inline=True)
-def _waited(held: float, width: float, above: int, up: float, down: float) -> float:
-    """Return a drag's output in a cell that the field has left, ``above`` cells above the field."""
-    # Below the field it takes its part in what has gone up since, above it in what has gone down.
-    if above < 0:
-        return width - (width - held) * math.exp(-up)
-    return held * math.exp(-down) if above > 0 else held
-
-
-@kernel()
-def drag_columns(
-    u: F64,
-    rows: I64,
-    length: float,
-    lowest: float,
-    width: float,
-    cells: int,
-    first: int,
-    out: F64_2D,
-) -> None:
-    """Fill in the output of a drag of weight 1 in each cell, for identification.
-
-    ``u`` is float64[n], a path from rest, of which the turning points are enough; ``rows`` is
-    int64[N], the samples that are filled in, rising. The c cells begin at ``lowest``, each with its
-    column of ``out``, float64[N, m], from ``first`` on; 0 is rest.
-    """
-    since = np.zeros(cells)
-    held = np.minimum(np.maximum(-lowest - width * np.arange(cells), 0.0), width)
-    last = up = down = 0.0
-    here = _cell(-lowest / width, cells)
-    k = 0
-    for row in range(rows.size):
-        while k <= rows[row]:
-            there, way = _cell((u[k] - lowest) / width, cells), abs(u[k] - last) / length
-            for j in range(min(here, there), max(here, there) + 1):
-                before = _waited(held[j], width, j - here, up - since[j], down - since[j])
-                held[j] = drag_step(before, lowest + j * width, width, last, u[k], length)
-                since[j] = (up if u[k] >= last else down) + way
-            up, down = (up + way, down) if u[k] >= last else (up, down + way)
-            here, last, k = there, u[k], k + 1
-        for j in range(cells):
-            now = _waited(held[j], width, j - here, up - since[j], down - since[j])
-            out[row, first + j] = now - _rest(j, lowest, width)
-
-
 @kernel()
 def mapped(x: float, knots: F64, values: F64) -> float:
     """Return the value at ``x`` of a line through points, continued straight at its ends."""

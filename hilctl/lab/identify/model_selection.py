@@ -170,7 +170,7 @@ def _extremes(record: Record) -> F64:
 
 
 WHOLE: tuple[Mapping[str, Any], ...] = (
-    {"kind": "field", "drags": 0, "plays": 8, "cells": 12, "knots": 16},
+    {"kind": "field", "plays": 8, "cells": 12, "knots": 16},
     {"kind": "generalised_duhem", "cells": 12, "across": 8},
 )
 """Candidates for histories: a small model of each kind, which is identified quickly."""
@@ -179,13 +179,8 @@ CREEPING: Mapping[str, Any] = {**WHOLE[0], "activation": True}
 PLAIN: Mapping[str, Any] = {"kind": "integrated", "offset": True}
 """Further candidate for histories if the error of all others is large."""
 WELL_PERCENT = 0.6  # mean error by stroke that small models of the right kind reach
-IN_FULL: Mapping[str, tuple[dict[str, Any], ...]] = {
-    "field": ({"kind": "field", "drags": 0}, {"kind": "field"}),
-    "generalised_duhem": ({"kind": "generalised_duhem"},),
-}
-"""Larger candidates of a kind whose small model has a small error, one after the other: the small
-loops of a field may creep."""
-LONGEST = max(map(len, IN_FULL.values()))
+IN_FULL = {"field", "generalised_duhem"}
+"""Kinds with a larger candidate, of their default size, if their small model has a small error."""
 NEAR = 2.0  # times the least error: a small model of the best kind may have it
 WORTH = 0.95  # of the error: a larger model must be below it, since it slows every run
 LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated", "offset": True})
@@ -246,19 +241,19 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
     if not errors:
         raise DataError(f"too few data to select a kind of model: {_undivided(request.records)}")
     best = min(errors, key=lambda tried: tried.stroke_percent)
-    near = [each for each in errors if each.stroke_percent <= NEAR * best.stroke_percent]
-    for turn in range(LONGEST if whole else 0):
-        chains = [(IN_FULL.get(each.settings.kind, ())[turn:], each) for each in near]
-        larger = [(chain[0] | _activation(each), each) for chain, each in chains if chain]
-        starts = [each.held_out.end for _, each in larger]
-        kinds = [more for more, _ in larger]
-        found = _candidates(request, given, kinds, starts)
+    near = [
+        each
+        for each in errors
+        if each.settings.kind in IN_FULL and each.stroke_percent <= NEAR * best.stroke_percent
+    ]
+    if near:
+        larger = [{"kind": each.settings.kind} | _activation(each) for each in near]
+        found = _candidates(request, given, larger, [each.held_out.end for each in near])
         if not any(each.stroke_percent < WELL_PERCENT for each in found):
-            found += _candidates(request, given, kinds)  # the small model may have misled them
+            found += _candidates(request, given, larger)  # the small model may have misled them
         errors += found
         better = [x for x in found if x.stroke_percent < WORTH * best.stroke_percent]
         best = min(better, key=lambda tried: tried.stroke_percent, default=best)
-        near = [best] if best in found else []
     return Selection(best.settings, best.held_out, candidates=tuple(e.candidate for e in errors))
 
 

@@ -69,7 +69,7 @@ CATALOGUE: Mapping[FitKind, CatalogueEntry] = {
         "plays, then an even function: rods without bias", _WEIGHTS_FOLLOW, LOOPS, fit_butterfly
     ),
     "field": CatalogueEntry(
-        "plays and drags of an effective field, with its losses",
+        "plays of an effective field, with its losses",
         "densities by non-negative least squares, stages by search",
         HISTORIES,
         fit_field,

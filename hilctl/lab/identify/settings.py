@@ -5,7 +5,7 @@ A new setting is a field of :class:`FitSettings`. The command line, the list of 
 """
 
 from collections.abc import Iterator, Mapping
-from typing import Any, Literal, Self, TypeAlias, get_args, get_origin
+from typing import Any, ClassVar, Literal, Self, TypeAlias, get_args, get_origin
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.fields import FieldInfo
@@ -52,6 +52,10 @@ def _of(kinds: tuple[str, ...], default: Any, description: str, **limits: Any) -
 class FitSettings(StrictModel):
     """Settings of a fit; the defaults are those published for the kind of model."""
 
+    REMOVED: ClassVar[Mapping[str, str]] = {
+        "drags": "removed: --model field fits plays only; --model generalised_duhem has such loops",
+    }
+
     kind: FitKind = Field("integrated", description="Kind of model.")
     plays: int = _of(
         (*_PLAYS, "generalised", "butterfly", "field"),
@@ -74,7 +78,6 @@ class FitSettings(StrictModel):
         ge=2,
         le=100,
     )
-    drags: int = _of(("field",), 3, "Drag operators; their small loops creep.", ge=0, le=12)
     cells: int = _of(
         _TABLES,
         28,

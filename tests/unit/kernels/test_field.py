@@ -6,7 +6,6 @@ import numpy as np
 import pytest
 
 from hilctl.kernels.field import (
-    drag_columns,
     drag_step,
     field_forward,
     field_inverse,
@@ -211,24 +210,6 @@ def test_a_drag_is_its_differential_equation(held, last, u, length):
         behind = min(max(middle - low, 0.0), width) - s
         s += behind * -math.expm1(-step / length) if behind * way > 0.0 else 0.0
     assert drag_step(held, low, width, last, u, length) == pytest.approx(s, abs=2e-5)
-
-
-def columns(u, rows, lowest, width, cells):
-    """Return what a drag of length 0.7 gives in each cell, after two columns of others."""
-    out = np.full((rows.size, cells + 3), 99.0)
-    drag_columns(np.ascontiguousarray(u), rows, 0.7, lowest, width, cells, 2, out)
-    assert (out[:, [0, 1, -1]] == 99.0).all()
-    return out[:, 2:-1]
-
-
-def test_cells_give_together_what_one_does_until_the_field_turns():
-    u, rows = np.linspace(0.0, 5.0, 40), np.array([0, 7, 20, 39])
-    one, four = columns(u, rows, -1.0, 4.0, 1), columns(u, rows, -1.0, 1.0, 4)
-    np.testing.assert_allclose(four.sum(axis=1), one[:, 0], atol=1e-12)
-    # Nor does it matter how many steps the field took there.
-    wanted = [drag_step(1.0, -1.0, 4.0, 0.0, now, 0.7) - 1.0 for now in u[rows]]
-    np.testing.assert_allclose(one[:, 0], wanted, atol=1e-12)
-    assert wanted[-1] > 2.0
 
 
 def test_a_line_through_points_goes_on_straight():

@@ -1,4 +1,4 @@
-"""Densities of plays and drags, and the output curve, by one non-negative least squares.
+"""Densities of plays, and the output curve, by one non-negative least squares.
 
 For a known effective field the output of the operators is linear in their densities, and the
 inverse curve is linear in its slopes. Its mean slope is 1, since both sides have a common factor.
@@ -6,7 +6,7 @@ A smoothness prior makes the solution unique.
 """
 
 from collections.abc import Sequence
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 from functools import cached_property
 
 import numpy as np
@@ -14,7 +14,7 @@ from scipy.linalg import cholesky, solve_triangular
 from scipy.optimize import nnls
 
 from hilctl.base.types import F64, I64
-from hilctl.kernels.field import drag_columns, play_paths
+from hilctl.kernels.field import play_paths
 from hilctl.lab.identify.field.design_matrix import needed_points, play_columns, plays_given
 from hilctl.lab.identify.least_squares import RIDGE, SearchPoint, differences
 
@@ -28,24 +28,23 @@ MOVED = 1e-3  # of the largest motion: columns that move less are ignored
 
 @dataclass(frozen=True, slots=True)
 class Grid:
-    """Thresholds and cells of the operators, in command units."""
+    """Thresholds of plays and pieces of their splines, in command units."""
 
     thresholds: F64
-    lengths: F64
-    lowest: float  # lower end of the first cell of the effective field
-    width: float
-    cells: int  # number of cells of a drag, and of splines of a play over the same range, >= 3
+    lowest: float  # lower end of the first piece, of the effective field
+    span: float  # of all pieces
+    splines: int  # of each play, >= 3
     knots: int  # pieces of the curve
 
     @property
-    def lines(self) -> int:
-        """Number of plays and drags."""
-        return int(self.thresholds.size + self.lengths.size)
+    def plays(self) -> int:
+        """Number of plays."""
+        return int(self.thresholds.size)
 
     @property
     def piece(self) -> float:
         """Width of a piece of the splines."""
-        return self.width * self.cells / (self.cells - 2)
+        return self.span / (self.splines - 2)
 
 
 @dataclass(frozen=True, slots=True)
@@ -77,7 +76,7 @@ class Curve:
 class Weights:
     """Fitted densities and curve."""
 
-    slopes: F64  # float64[lines, cells], um per command unit; for plays, weights of their splines
+    slopes: F64  # float64[plays, splines], um per command unit: weights of the splines
     curve: Curve  # from the output of the operators to displacement, without the offset
     offset_um: float  # displacement at rest
     errors_um: F64
@@ -90,17 +89,13 @@ class Weights:
 
 
 def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, creep: Creep | None = None) -> F64:
-    """Return each operator's output per cell at the kept samples: float64[N, lines cells]."""
-    plays, cells = grid.thresholds.size, grid.cells
+    """Return each play's output per spline at the kept samples: float64[N, plays splines]."""
     parts: list[F64] = []
     for k, (path, samples) in enumerate(zip(paths, kept, strict=True)):
         u, rows = _needed(path, samples)
-        out = np.empty((rows.size, grid.lines * cells))
+        out = np.empty((rows.size, grid.plays * grid.splines))
         held, _ = _plays(k, (path, samples), (u, rows), grid, creep)
-        play_columns(held, grid.lowest, grid.piece, cells, out)
-        for i, length in enumerate(grid.lengths):
-            first = (plays + i) * cells
-            drag_columns(u, rows, length, grid.lowest, grid.width, cells, first, out)
+        play_columns(held, grid.lowest, grid.piece, grid.splines, out)
         parts.append(out)
     return np.concatenate(parts)
 
@@ -132,18 +127,13 @@ def outputs(
     creep: Creep | None = None,
 ) -> tuple[F64, F64]:
     """Return the output of weighted operators and its slopes by thresholds: float64[N, p - 1]."""
-    plays = grid.thresholds.size
-    drags = replace(grid, thresholds=np.empty(0))
     given: list[F64] = []
     changes: list[F64] = []
     for k, (path, samples) in enumerate(zip(paths, kept, strict=True)):
         u, rows = _needed(path, samples)
-        total, by = np.empty(rows.size), np.empty((rows.size, plays))
-        weights = np.ascontiguousarray(slopes[:plays])
+        total, by = np.empty(rows.size), np.empty((rows.size, grid.plays))
         held, change = _plays(k, (path, samples), (u, rows), grid, creep)
-        plays_given(held, change, grid.lowest, grid.piece, weights, total, by)
-        if grid.lengths.size:
-            total += table([u], [rows], drags) @ slopes[plays:].ravel()
+        plays_given(held, change, grid.lowest, grid.piece, slopes, total, by)
         given.append(total)
         changes.append(by[:, 1:])
     return np.concatenate(given), np.concatenate(changes)
@@ -164,7 +154,7 @@ class Equations:
         self._y, self._grid, self._scale = y, grid, scale
         moved = np.ptp(columns, axis=0)
         self._used = moved > MOVED * float(moved.max())
-        self._used[: grid.cells] = True
+        self._used[: grid.splines] = True
         # Magnetostriction begins and ends flat, where its inverse bends most and needs corners.
         even = 0.5 - 0.5 * np.cos(np.pi * np.linspace(EDGE, 1.0 - EDGE, grid.knots + 1))
         self._knots = float(y.min()) + float(np.ptp(y)) * (even - even[0]) / (even[-1] - even[0])
@@ -176,7 +166,7 @@ class Equations:
         self._left = np.hstack([columns[:, self._used], bends])
         self._target = float(self._share.sum()) * parts[:, anchor] + noise
         self._lows = np.zeros(self._left.shape[1])
-        self._lows[: grid.cells] = least
+        self._lows[: grid.splines] = least
         self._lows[self._left.shape[1] - self._others.size :] = 1.0 / STEEPEST
         longest = float(np.sqrt((scale**2 @ columns**2).max()))
         held = CURVE_SMOOTH * float(np.ptp(y)) / grid.knots * float(np.linalg.norm(scale))
@@ -206,8 +196,8 @@ class Equations:
         residual = misfit * self._scale
         held = self._prior @ found - self._wanted
         squares = float(residual @ residual + held @ held)
-        lines = slopes.reshape(grid.lines, grid.cells)
-        return Weights(lines, curve, offset_um, misfit / curve_slopes[piece], squares)
+        densities = slopes.reshape(grid.plays, grid.splines)
+        return Weights(densities, curve, offset_um, misfit / curve_slopes[piece], squares)
 
     def place(self, errors: F64, changes: F64) -> SearchPoint:
         """Return the sum of squares with derivatives by the changes (Kaufman's approximation)."""
@@ -257,9 +247,9 @@ def _prior(
     """Return rows and targets of the prior: smooth and small densities."""
     others, anchor, share, held = curve
     count = int(used.sum())
-    number = np.where(used, np.cumsum(used) - 1, -1).reshape(grid.lines, grid.cells)
-    smooth = SMOOTH * min(1.0, SMOOTH_PLAYS / grid.thresholds.size)
-    plays = number[1 : grid.thresholds.size]
+    number = np.where(used, np.cumsum(used) - 1, -1).reshape(grid.plays, grid.splines)
+    smooth = SMOOTH * min(1.0, SMOOTH_PLAYS / grid.plays)
+    plays = number[1:]
     pairs = (number[:, :-1], number[:, 1:], smooth), (plays[:-1], plays[1:], 0.5 * smooth)
     width = count + others.size
     out = [weight * longest * differences(a, b, width) for a, b, weight in pairs]

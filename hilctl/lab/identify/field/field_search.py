@@ -120,7 +120,6 @@ class JointRefinement:
 
 
 MARGIN = 0.1  # of the span: margin of the tables beyond the data
-LENGTHS = (0.05, 0.4)  # of half the span: shortest and longest drag
 SEARCH_ROWS, POLISH_ROWS, FINAL_ROWS = 2500, 4000, 12_000
 ROUNDS = 2
 FIRST_LAGS = (0.02, 0.1, 0.4)  # lags of the field of the starts
@@ -135,14 +134,13 @@ class Size:
     """Numbers of operators and cells."""
 
     plays: int
-    drags: int
     cells: int
     knots: int
 
     @property
     def coarse(self) -> "Size":
         """Smaller numbers, for the search."""
-        return Size(min(self.plays, 8), self.drags, min(self.cells, 12), min(self.knots, 16))
+        return Size(min(self.plays, 8), min(self.cells, 12), min(self.knots, 16))
 
 
 @dataclass(frozen=True, slots=True)
@@ -266,7 +264,7 @@ class FieldSearch:
 
     def _signals(self, x: F64) -> tuple[list[F64], list[F64]]:
         known = physical(stages_in(x), self._data)
-        span = self._grid.width * self._grid.cells if self._grid else 2.0 * self._data.reach
+        span = self._grid.span if self._grid else 2.0 * self._data.reach
         curve, runs = self._curve, self._data.runs
         both = parallel_map(lambda run: signals(run, known, curve, span), runs)
         return [u for u, _ in both], [y for _, y in both]
@@ -286,13 +284,12 @@ class FieldSearch:
     def _learn(self, x: F64) -> None:
         """Solve for weights, and update curve, errors and largest threshold for the next time."""
         found, grid = self._solved(x), self._laid()
-        plays = grid.thresholds.size
         self._curve, self._off_um = self._between(found), found.errors_um
         weights = found.slopes.sum(axis=1)
-        tail = np.cumsum(weights[:plays][::-1])[::-1]
+        tail = np.cumsum(weights[::-1])[::-1]
         beyond = int(np.argmax(np.append(tail, 0.0) < TAIL * float(weights.sum())))
-        widest = 1.2 * float(grid.thresholds[min(beyond, plays - 1)])
-        half = 0.5 * grid.width * grid.cells / (1.0 + 2.0 * MARGIN)
+        widest = 1.2 * float(grid.thresholds[min(beyond, grid.plays - 1)])
+        half = 0.5 * grid.span / (1.0 + 2.0 * MARGIN)
         self._widest = min(1.0, max(widest / half, LEAST_WIDEST))
 
     def _between(self, found: Weights) -> Curve:
@@ -303,17 +300,14 @@ class FieldSearch:
         return Curve(0.5 * (found.curve.operators + self._curve.operators_of(y)), y)
 
     def _lay(self, stages: Stages, size: Size) -> None:
-        """Place the cells over the range of the field."""
+        """Place the splines over the range of the field."""
         fields, _ = self._signals(row(stages))
         low = min(float(u.min()) for u in fields)
         high = max(float(u.max()) for u in fields)
         span = high - low
-        lowest, width = low - MARGIN * span, (1.0 + 2.0 * MARGIN) * span / size.cells
-        spread = np.arange(size.plays) / size.plays
-        lengths = 0.5 * span * _lengths(size.drags)
-        self._grid = Grid(
-            0.5 * span * self._widest * spread, lengths, lowest, width, size.cells, size.knots
-        )
+        thresholds = 0.5 * span * self._widest * np.arange(size.plays) / size.plays
+        lowest, room = low - MARGIN * span, (1.0 + 2.0 * MARGIN) * span
+        self._grid = Grid(thresholds, lowest, room, size.cells, size.knots)
 
     def _choose(self, most: int) -> None:
         self._rows = chosen([run.motion for run in self._data.runs], most)
@@ -321,7 +315,7 @@ class FieldSearch:
 
     def _end(self, x: F64, before: Grid | None) -> FieldEnd:
         self._choose(POLISH_ROWS)
-        kept = before is not None and before.thresholds.size == self._size.plays
+        kept = before is not None and before.plays == self._size.plays
         for _ in range(1 if kept else 2):
             self._lay(stages_in(x), self._size)
             if kept and before is not None:
@@ -336,22 +330,14 @@ class FieldSearch:
         return FieldEnd(known, self._laid(), found, self._curve, self._widest, held)
 
 
-def _lengths(count: int) -> F64:
-    """Return lengths of drags, of half the span."""
-    if count == 1:
-        return np.array([0.15])
-    first, last = np.log(LENGTHS)
-    return np.exp(np.linspace(first, last, count))
-
-
 FINER = 8  # cells of the model's tables per piece of a spline
 
 
 def fit_field(job: FitJob) -> FoundModel:
-    """Fit plays and drags of a field, losses, structure and delay; raise DataError for loops."""
+    """Fit plays of a field, losses, structure and delay; raise DataError for loops."""
     settings = job.settings
     data = Prepared(histories_of(job.data.records, "an effective field"))
-    size = Size(settings.plays, settings.drags, settings.cells, settings.knots)
+    size = Size(settings.plays, settings.cells, settings.knots)
     search = FieldSearch(data, size, job.least, job.structure, activation=settings.activation)
     if isinstance(job.start, FieldEnd):
         found = search.go_on(job.start)
@@ -364,14 +350,11 @@ def fit_field(job: FitJob) -> FoundModel:
 
 def _model(job: FitJob, found: FieldEnd) -> StagedModel:
     grid, weights, known = found.grid, found.weights, found.known
-    drags = weights.slopes[grid.thresholds.size :].tolist()
-    lines = (*tabled(weights.slopes[: grid.thresholds.size]), *drags)
     hysteresis = FieldModel(
         thresholds=tuple(grid.thresholds.tolist()),
-        lengths=tuple(grid.lengths.tolist()),
         lowest=grid.lowest,
         cell=grid.piece / FINER,
-        slopes=tuple(tuple(line) for line in lines),
+        slopes=tuple(map(tuple, tabled(weights.slopes))),
         curve=OutputCurve(
             operators_um=tuple(weights.curve.operators.tolist()),
             displacement_um=tuple(weights.curve.displacement_um.tolist()),

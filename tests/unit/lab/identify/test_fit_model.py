@@ -207,7 +207,7 @@ RATE_HZ = 2000.0
 MODE = FurtherMode(
     natural_hz=150.0, damping_ratio=0.1, antiresonance_hz=140.0, antiresonance_damping_ratio=0.1
 )
-FIELD = FitSettings(kind="field", plays=8, drags=0, cells=8, knots=8)
+FIELD = FitSettings(kind="field", plays=8, cells=8, knots=8)
 TRUTH = StagedModel.around(
     SMALL_OMEGA,
     lag=FieldLag(tau_s=1e-3),

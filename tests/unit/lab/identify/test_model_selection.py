@@ -98,17 +98,17 @@ HISTORY = History("history", WAVE, 9.0 * WAVE, 100.0)
 LOOP = SteadyLoop("loop", WAVE, 9.0 * WAVE, 1.0)
 
 
-SMALL = {"field 0 8": 0.3, "generalised_duhem 12": 0.5, "field 0 32": 0.15, "field 3 32": 0.1}
+SMALL = {"field 8": 0.3, "generalised_duhem 12": 0.5, "field 32": 0.15}
 
 
 def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> list[tuple[str, Any]]:
-    """Let fits have errors by kind, drags and size; return the list of them and their starts."""
+    """Let fits have errors by kind and size; return the list of them and their starts."""
     seen = []
 
     def held_out(request):
         settings = request.settings
         name = {
-            "field": f"field {settings.drags} {settings.plays}",
+            "field": f"field {settings.plays}",
             "generalised_duhem": f"generalised_duhem {settings.cells}",
         }.get(settings.kind, settings.kind)
         name += " creeping" * settings.looks_for("activation")
@@ -141,26 +141,21 @@ def test_the_kind_whose_small_model_does_well_is_tried_in_full(monkeypatch):
     seen = fake(monkeypatch, {**SMALL, "generalised_duhem 12": 0.7})
     found = select(FitRequest([HISTORY], settings_from("auto", [])))
     settings, held_out, errors = found.settings, found.held_out, found.candidates
-    assert (settings.kind, settings.drags, settings.whole) == ("field", 3, True)
-    assert held_out.judgement.rms_percent == 0.1
-    assert [error.rms_percent for error in errors] == [0.3, 0.7, 0.15, 0.1]
-    # Each goes on from where the one before it ended, and the fit to all data from the last.
-    starts = [start for _, start in seen]
-    assert starts == [None, None, "end of field 0 8", "end of field 0 32"]
-    assert held_out.end == "end of field 3 32"
+    assert (settings.kind, settings.plays, settings.whole) == ("field", 32, True)
+    assert held_out.judgement.rms_percent == 0.15
+    assert [error.rms_percent for error in errors] == [0.3, 0.7, 0.15]
+    # The larger one goes on from where the small one ended, and the fit to all data from there.
+    assert [start for _, start in seen] == [None, None, "end of field 8"]
+    assert held_out.end == "end of field 32"
 
 
 def test_plays_that_creep_are_tried_in_full_if_rests_creep(monkeypatch):
     monkeypatch.setattr(model_selection, "creeps", lambda records: True)
-    creeping = {
-        "field 0 8 creeping": 0.2,
-        "field 0 16 creeping": 0.08,
-        "field 3 16 creeping": 0.05,
-    }
+    creeping = {"field 8 creeping": 0.2, "field 16 creeping": 0.08}
     seen = fake(monkeypatch, {**SMALL, "generalised_duhem 12": 9.0, **creeping})
     settings, _ = chosen([HISTORY])
     assert settings.activation
-    assert [name for name, _ in seen][-1] == "field 3 16 creeping"
+    assert [name for name, _ in seen][-1] == "field 16 creeping"
 
 
 def test_full_models_with_a_large_error_are_tried_from_the_data_too(monkeypatch):
@@ -168,13 +163,13 @@ def test_full_models_with_a_large_error_are_tried_from_the_data_too(monkeypatch)
     large |= {"generalised_duhem 12": 20.0, "integrated": 30.0}
     seen = fake(monkeypatch, large)
     chosen([HISTORY])
-    assert [start for name, start in seen if name == "field 3 32"] == ["end of field 0 32", None]
+    assert [start for name, start in seen if name == "field 32"] == ["end of field 8", None]
 
 
 def test_more_operators_are_taken_only_where_they_are_worth_it(monkeypatch):
-    fake(monkeypatch, {**SMALL, "generalised_duhem 12": 0.7, "field 3 32": 0.99 * 0.15})
+    fake(monkeypatch, {**SMALL, "generalised_duhem 12": 0.7, "field 32": 0.99 * 0.3})
     settings, _ = chosen([HISTORY])
-    assert (settings.kind, settings.drags) == ("field", 0)
+    assert (settings.kind, settings.plays) == ("field", 8)
 
 
 def test_a_kind_that_is_near_is_tried_in_full_as_well(monkeypatch):
@@ -203,7 +198,7 @@ def test_a_kind_is_selected_on_small_motions_as_well(monkeypatch):
 
 @pytest.mark.parametrize("plain", [0.8, 5.0])
 def test_a_plain_kind_is_tried_where_no_other_does_well(plain, monkeypatch):
-    poor = {"field 0 8": 2.0, "generalised_duhem 12": 1.9, "field 0 32": 1.8, "field 3 32": 1.8}
+    poor = {"field 8": 2.0, "generalised_duhem 12": 1.9, "field 32": 1.8}
     fake(monkeypatch, {**poor, "generalised_duhem 28": 1.7, "integrated": plain})
     settings, _ = chosen([HISTORY])
     assert settings.kind == ("integrated" if plain < 1.0 else "generalised_duhem")
@@ -217,7 +212,7 @@ def test_loops_have_candidates_of_their_own(monkeypatch):
 
 
 def test_without_anything_held_out_there_is_no_choice(monkeypatch):
-    fake(monkeypatch, dict.fromkeys(("field 0 8", "generalised_duhem 12", "integrated")))
+    fake(monkeypatch, dict.fromkeys(("field 8", "generalised_duhem 12", "integrated")))
     with pytest.raises(DataError, match="--model"):
         chosen([HISTORY])
 

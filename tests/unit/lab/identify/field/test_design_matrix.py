@@ -1,4 +1,4 @@
-"""What the fit takes plays and drags for is what the model makes of them."""
+"""What the fit takes plays for is what the model makes of them."""
 
 import numpy as np
 import pytest
@@ -16,11 +16,8 @@ from hilctl.lab.identify.field.design_matrix import (
 from hilctl.lab.identify.field.field_search import FINER, tabled
 from hilctl.models.effective_field import FieldModel, OutputCurve
 
-GRID = Grid(np.array([0.0, 0.7, 2.0]), np.array([0.6, 2.5]), -6.0, 3.0, 4, 2)
-SLOPES = np.array(
-    [[2.0, 2.5, 3.0, 2.0], [0.5, 1.0, 1.0, 0.0], [0.0, 1.0, 2.0, 1.0], [1.0, 2.0, 2.0, 1.0],
-     [0.5, 3.0, 0.0, 1.0]]
-)  # fmt: skip
+GRID = Grid(np.array([0.0, 0.7, 2.0]), -6.0, 12.0, 4, 2)
+SLOPES = np.array([[2.0, 2.5, 3.0, 2.0], [0.5, 1.0, 1.0, 0.0], [0.0, 1.0, 2.0, 1.0]])
 
 
 def path() -> np.ndarray:
@@ -32,11 +29,13 @@ def path() -> np.ndarray:
 def test_columns_times_slopes_are_the_model():
     u = np.ascontiguousarray(path())
     line = OutputCurve(operators_um=(-1.0, 1.0), displacement_um=(-1.0, 1.0))
-    slopes = (*tabled(SLOPES[:3]), *SLOPES[3:].tolist())
     model = FieldModel(
-        thresholds=tuple(GRID.thresholds), lengths=tuple(GRID.lengths), lowest=GRID.lowest,
-        cell=GRID.piece / FINER, slopes=tuple(map(tuple, slopes)), curve=line,
-    )  # fmt: skip
+        thresholds=tuple(GRID.thresholds),
+        lowest=GRID.lowest,
+        cell=GRID.piece / FINER,
+        slopes=tuple(map(tuple, tabled(SLOPES))),
+        curve=line,
+    )
     modelled = model.forward(1.0).process(u)
     rows = np.arange(u.size)
     columns = table([u], [rows], GRID)

@@ -35,7 +35,7 @@ from tests.unit.lab.identify.field.test_duhem_search import RATE_HZ as FAST_HZ
 from tests.unit.lab.identify.field.test_duhem_search import command
 
 RATE_HZ = 2000.0
-SIZE = Size(4, 1, 6, 5)
+SIZE = Size(4, 6, 5)
 LEAST = 0.05
 
 
@@ -43,10 +43,9 @@ def made(v: F64) -> F64:
     """Return what the known model does: float64[n], in um."""
     hysteresis = FieldModel(
         thresholds=(0.0, 1.0),
-        lengths=(1.5,),
         lowest=-9.0,
         cell=6.0,
-        slopes=((4.0, 5.0, 4.0), (1.0, 1.0, 0.5), (2.0, 3.0, 2.0)),
+        slopes=((6.0, 8.0, 6.0), (1.0, 1.0, 0.5)),
         curve=OutputCurve(operators_um=(-60.0, 0.0, 60.0), displacement_um=(-50.0, 0.0, 45.0)),
         losses=FieldLosses(field_s=5e-4),
     )
@@ -91,23 +90,22 @@ def test_the_data_are_met_and_what_is_late_in_all_is_found():
 
 def test_the_size_is_what_was_asked_for():
     end = found()
-    assert end.weights.slopes.shape == (SIZE.plays + SIZE.drags, SIZE.cells)
+    assert end.weights.slopes.shape == (SIZE.plays, SIZE.cells)
     assert end.weights.curve.operators.size == SIZE.knots + 1
     assert end.grid.thresholds.size == SIZE.plays
-    assert end.grid.lengths.size == SIZE.drags
 
 
 def test_units_make_no_difference():
     one, other = found(), found(unit=4.0, um=2.0)
     assert other.known.losses.field_s == pytest.approx(one.known.losses.field_s, rel=1e-3)
     assert other.grid.thresholds == pytest.approx(4.0 * one.grid.thresholds, rel=1e-3)
-    assert other.grid.width == pytest.approx(4.0 * one.grid.width, rel=1e-3)
+    assert other.grid.span == pytest.approx(4.0 * one.grid.span, rel=1e-3)
     assert other.weights.slopes == pytest.approx(0.5 * one.weights.slopes, rel=0.01, abs=0.01)
 
 
 def test_progress_rises_below_1_and_names_each_round():
     seen: list[tuple[float, str]] = []
-    FieldSearch(data(), Size(2, 0, 3, 3), LEAST).find(lambda part, what: seen.append((part, what)))
+    FieldSearch(data(), Size(2, 3, 3), LEAST).find(lambda part, what: seen.append((part, what)))
     parts = [part for part, _ in seen]
     assert parts == sorted(set(parts))
     assert 0.0 < parts[0] <= parts[-1] < 1.0
@@ -145,8 +143,8 @@ def test_a_search_ends_within_its_bounds_though_it_starts_beyond():
 
 
 def test_a_search_is_never_of_more_operators_than_were_asked_for():
-    assert Size(40, 3, 50, 60).coarse == Size(8, 3, 12, 16)
-    assert Size(4, 0, 6, 5).coarse == Size(4, 0, 6, 5)
+    assert Size(40, 50, 60).coarse == Size(8, 12, 16)
+    assert Size(4, 6, 5).coarse == Size(4, 6, 5)
 
 
 def test_the_least_slope_of_the_first_line_holds_throughout_the_search():
@@ -157,7 +155,7 @@ def test_the_least_slope_of_the_first_line_holds_throughout_the_search():
 
 
 TRUE_R = 0.85
-GRID = Grid(np.array([0.0, 0.7, 1.4]), np.empty(0), -4.0, 1.6, 5, 4)
+GRID = Grid(np.array([0.0, 0.7, 1.4]), -4.0, 8.0, 5, 4)
 
 
 def path(gain: float = 1.0) -> F64:
@@ -172,7 +170,7 @@ SPACE = StageSpace(row(LOW), row(HIGH))
 
 def displacement_um() -> F64:
     """Return what plays of no threshold and of the true one give along the path."""
-    true = Grid(np.array([0.0, TRUE_R]), np.empty(0), -4.0, 1.6, 5, 4)
+    true = Grid(np.array([0.0, TRUE_R]), -4.0, 8.0, 5, 4)
     return np.asarray(table([path()], KEPT, true) @ np.repeat([3.0, 2.0], 5))
 
 
@@ -214,13 +212,11 @@ def test_a_stage_is_found_with_the_weights_free():
     assert x.size == STAGES
 
 
-@pytest.mark.parametrize("lengths", [(), (0.6, 1.5)])
-def test_operators_of_known_weights_give_what_their_columns_do(lengths):
-    grid = replace(GRID, lengths=np.array(lengths))
-    slopes = np.random.default_rng(3).uniform(0.5, 2.0, (grid.lines, 5))
-    for gain in (1.0, 2.0):  # within the cells, and beyond them
-        given, _ = outputs([path(gain)] * 2, KEPT * 2, grid, slopes)
-        columns = table([path(gain)] * 2, KEPT * 2, grid)
+def test_operators_of_known_weights_give_what_their_columns_do():
+    slopes = np.random.default_rng(3).uniform(0.5, 2.0, (GRID.plays, 5))
+    for gain in (1.0, 2.0):  # within the pieces, and beyond them
+        given, _ = outputs([path(gain)] * 2, KEPT * 2, GRID, slopes)
+        columns = table([path(gain)] * 2, KEPT * 2, GRID)
         assert given == pytest.approx(columns @ slopes.ravel(), abs=1e-9)
 
 
@@ -252,7 +248,7 @@ def model() -> StagedModel:
 
 @pytest.mark.slow
 def test_a_history_that_was_not_fitted_is_met():
-    settings = FitSettings(kind="field", plays=6, drags=1, cells=8, knots=6)
+    settings = FitSettings(kind="field", plays=6, cells=8, knots=6)
     found = fit_model(FitRequest([history(1, 0.01)], settings))
     judged = judge(found.model, [history(2, 0.0)])
     assert judged.rms_percent < 0.6
