@@ -249,8 +249,6 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
     if near:
         larger = [{"kind": each.settings.kind} | _activation(each) for each in near]
         found = _candidates(request, given, larger, [each.held_out.end for each in near])
-        if not any(each.stroke_percent < WELL_PERCENT for each in found):
-            found += _candidates(request, given, larger)  # the small model may have misled them
         errors += found
         better = [x for x in found if x.stroke_percent < WORTH * best.stroke_percent]
         best = min(better, key=lambda tried: tried.stroke_percent, default=best)

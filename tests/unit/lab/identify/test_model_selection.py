@@ -158,14 +158,6 @@ def test_plays_that_creep_are_tried_in_full_if_rests_creep(monkeypatch):
     assert [name for name, _ in seen][-1] == "field 16 creeping"
 
 
-def test_full_models_with_a_large_error_are_tried_from_the_data_too(monkeypatch):
-    large = {name: 10.0 * error for name, error in SMALL.items()}
-    large |= {"generalised_duhem 12": 20.0, "integrated": 30.0}
-    seen = fake(monkeypatch, large)
-    chosen([HISTORY])
-    assert [start for name, start in seen if name == "field 32"] == ["end of field 8", None]
-
-
 def test_more_operators_are_taken_only_where_they_are_worth_it(monkeypatch):
     fake(monkeypatch, {**SMALL, "generalised_duhem 12": 0.7, "field 32": 0.99 * 0.3})
     settings, _ = chosen([HISTORY])
