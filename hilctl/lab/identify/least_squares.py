@@ -49,9 +49,9 @@ def bounded_and_free(
 
 
 def smooth_densities(
-    columns: F64, target: F64, scale: F64, least: F64, table: I64, smoothness: float
+    columns: F64, target: F64, least: F64, table: I64, smoothness: float
 ) -> tuple[F64, float]:
-    """Minimise the sum of (scale (columns w + c - target))^2 over densities w >= least, and c.
+    """Minimise the sum of (columns w + c - target)^2 over densities w >= least, and c.
 
     Loops leave many densities of a triangle undetermined, and least squares alone would turn them
     into spikes. A penalty on differences of neighbours, and a small one on the densities
@@ -59,11 +59,11 @@ def smooth_densities(
     density of each cell, -1 for none; ``smoothness`` is relative to the longest column.
     """
     size, samples = columns.shape[1], target.size
-    longest = float(np.linalg.norm(columns * scale[:, None], axis=0).max())
+    longest = float(np.linalg.norm(columns, axis=0).max())
     rows = smoothness * differences(table[:, :-1], table[:, 1:], size), RIDGE * np.eye(size)
-    held = np.vstack([columns * scale[:, None], *(longest * part for part in rows)])
+    held = np.vstack([columns, *(longest * part for part in rows)])
     free, right = np.zeros((len(held), 1)), np.zeros(len(held))
-    free[:samples, 0], right[:samples] = scale, target * scale
+    free[:samples, 0], right[:samples] = 1.0, target
     weights, constant = bounded_and_free(held, free, right, np.ones(len(held)), least)
     return weights, float(constant[0])
 

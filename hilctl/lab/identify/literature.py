@@ -5,9 +5,7 @@ follow from bounded least squares; only the shape of operators is searched.
 """
 
 import math
-from collections.abc import Callable, Mapping, Sequence
-from functools import partial
-from typing import Any
+from collections.abc import Sequence
 
 import numpy as np
 
@@ -15,8 +13,7 @@ from hilctl.base.types import F64, I64
 from hilctl.kernels.generalised_play import envelope_outputs
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.kernels.implicit_models import BOUC_WEN, implicit_forward
-from hilctl.lab.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel
-from hilctl.lab.identify.fit_data import FitData
+from hilctl.lab.identify.fit_api import FitJob, FoundModel
 from hilctl.lab.identify.least_squares import (
     bounded_weights,
     converged,
@@ -58,49 +55,32 @@ def weigh(job: FitJob, columns: F64, least: F64, rows: slice = slice(None)) -> t
 
 def fit_preisach(job: FitJob) -> FoundModel:
     """Fit the densities >= 0 of a Preisach triangle (1.2) over the largest loop."""
-    data = job.data
-    plays = data.columns(triangle_thresholds(data, job.settings.lines))[:, 1:]
-    fields = {"command_span": data.command_span, **data.common(0.0)}
-    model, numbers = fit_triangle(data, plays, partial(_smooth, job), fields)
-    return FoundModel(model, numbers + 1)
-
-
-def _smooth(job: FitJob, columns: F64, least: F64, table: I64) -> tuple[F64, float]:
-    target_um = job.data.target_um
-    ones = np.ones(target_um.size)
-    return smooth_densities(columns, target_um, ones, least, table, SMOOTHNESS)
-
-
-def triangle_thresholds(data: FitData, lines: int) -> F64:
-    """Return the thresholds of the plays that a triangle's lines follow: float64[lines]."""
-    return data.reach / lines * np.arange(lines, dtype=np.float64)
-
-
-def fit_triangle(
-    data: FitData,
-    centres: F64,
-    fit: Callable[[F64, F64, I64], tuple[F64, float]],
-    fields: Mapping[str, Any],
-) -> tuple[PreisachModel, int]:
-    """Return a Preisach model, and how many of its cells have a density."""
-    # centres: float64[N, lines]. fit(columns, lower bounds, table) returns densities and offset.
-    lines, (low, high) = centres.shape[1], data.input_range
+    data, lines = job.data, job.settings.lines
+    low, high = data.input_range
+    thresholds = data.reach / lines * np.arange(lines, dtype=np.float64)
     edges = np.linspace(low, high, lines + 1)
     cell = float(edges[1] - edges[0])
+    # A line follows the play of its threshold.
+    centres = data.columns(thresholds)[:, 1:]
     columns = np.concatenate([cells_below(centre, edges) for centre in centres.T], axis=1)
     moved = largest_swing(columns, data.places) > STILL * cell
     slopes = np.zeros(columns.shape[1])
-    slopes[:lines] = LEAST_SLOPE * data.gain
+    slopes[:lines] = job.least
     table = numbered(moved).reshape(lines, lines)
-    slopes[moved], offset_um = fit(columns[:, moved], slopes[moved], table)
+    slopes[moved], offset_um = _smooth(job, columns[:, moved], slopes[moved], table)
     model = PreisachModel(
-        thresholds=tuple(triangle_thresholds(data, lines).tolist()),
+        command_span=data.command_span,
+        thresholds=tuple(thresholds.tolist()),
         lowest=low,
         cell=cell,
         slopes=tuple(map(tuple, slopes.reshape(lines, lines).tolist())),
-        **{**fields, "output_offset_um": offset_um},
+        **data.common(offset_um),
     )
-    return model, int(moved.sum())
+    return FoundModel(model, int(moved.sum()) + 1)
+
+
+def _smooth(job: FitJob, columns: F64, least: F64, table: I64) -> tuple[F64, float]:
+    return smooth_densities(columns, job.data.target_um, least, table, SMOOTHNESS)
 
 
 def largest_swing(columns: F64, places: Sequence[slice]) -> F64:

@@ -24,7 +24,7 @@ from hilctl.lab.identify.staged.staged_fits import fit_free, fit_staged
 ANY = "steady loops, or whole histories"
 HISTORIES = "whole histories"
 LOOPS = "steady loops"
-STAGES = "steady loops at one sample rate; whole histories without lag, structure and delay"
+STAGES = "steady loops at one sample rate"
 
 
 @dataclass(frozen=True, slots=True)

@@ -55,14 +55,10 @@ class Layers:
 
     plays: int
     deadbands: int
-    lag: bool = True
-    growth: bool = True  # whether it grows with its distance
+    stages: bool = True  # lag, structure and delay
     gamma: bool = False  # whether thresholds grow with the rate
-    structure: bool = True
-    delay: bool = True
     half_period_s: float = 0.0  # half a sample period of the loop; 0.0 to ignore its delay
     offset: bool = True
-    staged: bool = False  # whether the model has stages, at least a delay
 
     @property
     def numbers(self) -> F64:
@@ -72,11 +68,6 @@ class Layers:
     def spacing_limit(self, reach: float) -> float:
         """Return the largest spacing at which every play still moves in a full cycle."""
         return reach / (self.plays + 0.5)
-
-    @property
-    def dynamic(self) -> bool:
-        """Whether any stage has dynamics."""
-        return self.lag or self.structure or self.delay or self.half_period_s > 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -121,13 +112,13 @@ def bounds(data: FitData, layers: Layers, point: Point) -> tuple[F64, F64]:
     limit, steepest = layers.spacing_limit(data.reach), 4.0 * data.gain
     apart = data.stroke_um / (layers.deadbands + 1)
     free = [
-        (1e-3 * radian_s, 3.0 * radian_s, layers.lag),
-        (0.0, 20.0 / data.reach, layers.lag and layers.growth),
+        (1e-3 * radian_s, 3.0 * radian_s, layers.stages),
+        (0.0, 20.0 / data.reach, layers.stages),
         (0.05 * limit, limit, True),
         (0.0, data.reach / data.speed, layers.gamma),
-        (0.0, radian_s, layers.delay),
-        (1e-3 * radian_s, 2.0 * radian_s, layers.structure),
-        (1e-4 * radian_s**2, 4.0 * radian_s**2, layers.structure),
+        (0.0, radian_s, layers.stages),
+        (1e-3 * radian_s, 2.0 * radian_s, layers.stages),
+        (1e-4 * radian_s**2, 4.0 * radian_s**2, layers.stages),
         (LEAST_SLOPE * data.gain, steepest, True),
         *[(0.0, steepest, True)] * layers.plays,
         *[(LEAST_SLOPE, STEEPEST, True)] * (2 * layers.deadbands),
@@ -172,7 +163,7 @@ def error_and_slopes(data: FitData, layers: Layers, point: Point) -> tuple[F64, 
     slopes = np.empty((w.size, out.shape[1] + 3))
     slopes[:, :PARAMETERS] = out[:, 1:first]
     slopes[:, PARAMETERS:DYNAMIC] = 0.0
-    if layers.dynamic:
+    if layers.stages:
         slopes[:, PARAMETERS:DYNAMIC] = data.linear_slopes(bare, linear)
         by_lag = loop_delay_slope(layers.half_period_s, lag_s)
         slopes[:, LAG_S] += by_lag * slopes[:, PARAMETERS]
@@ -200,7 +191,6 @@ def segments(x: F64, corners: F64) -> F64:
 
 
 HIGHEST_DAMPING = 10.0  # of a FirstMode
-STAGE_PARAMETERS = ("tau_s", "growth_per_unit", "natural_hz", "damping_ratio", "delay_s")
 
 
 def integrated_model(data: FitData, layers: Layers, point: Point) -> IntegratedModel:
@@ -225,18 +215,11 @@ def integrated_model(data: FitData, layers: Layers, point: Point) -> IntegratedM
 
 def staged_model(data: FitData, layers: Layers, point: Point) -> StagedModel:
     """Return Omega with the stages around it."""
-    lag = None
-    if layers.lag:
-        tau_s, growth = float(point.before[0]), float(point.before[1])
-        lag = FieldLag(tau_s=tau_s, growth_per_unit=growth)
-    structure = None
-    if layers.structure:
-        natural_hz, damping = structure_of(point.linear)
-        structure = FirstMode(natural_hz=natural_hz, damping_ratio=damping)
+    natural_hz, damping = structure_of(point.linear)
     return StagedModel.around(
         integrated_model(data, layers, point),
-        lag=lag,
-        structure=structure,
+        lag=FieldLag(tau_s=float(point.before[LAG_S]), growth_per_unit=float(point.before[GROWTH])),
+        structure=FirstMode(natural_hz=natural_hz, damping_ratio=damping),
         delay_s=point.linear.delay_s,
     )
 
@@ -260,15 +243,13 @@ def parameters(layers: Layers, point: Point) -> dict[str, Parameter]:
         return float(x[number]), {number: 1.0}
 
     out: dict[str, Parameter] = {}
-    if layers.lag:
+    if layers.stages:
         out |= {"tau_s": own(LAG_S), "growth_per_unit": own(GROWTH)}
-    if layers.structure:
         natural_hz, damping = structure_of(point.linear)
         radian_s, c_s = math.sqrt(point.linear.q_s2), point.linear.c_s
         out["natural_hz"] = natural_hz, {Q_S2: -0.25 / (math.pi * radian_s**3)}
         by_q = -0.25 * c_s / radian_s**3
         out["damping_ratio"] = damping, {C_S: 0.5 / radian_s, Q_S2: by_q}
-    if layers.staged:
         out["delay_s"] = own(DELAY)
     out["alpha"] = own(SPACING)
     if layers.gamma:

@@ -10,40 +10,29 @@ import math
 from collections.abc import Mapping
 from dataclasses import dataclass, replace
 from itertools import product
-from typing import Any
 
 import numpy as np
 
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64, I64, Mask
+from hilctl.base.types import F64, Mask
 from hilctl.lab.identify.evaluation import weight_roots
 from hilctl.lab.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel, StartOutcome
-from hilctl.lab.identify.fit_data import GROWTH, LAG_S, FitData, Linear
-from hilctl.lab.identify.least_squares import (
-    bounded_weights,
-    descend,
-    first_least,
-    smooth_densities,
-)
-from hilctl.lab.identify.literature import fit_triangle, triangle_thresholds
-from hilctl.lab.identify.settings import FitSettings
+from hilctl.lab.identify.fit_data import FitData, Linear
+from hilctl.lab.identify.least_squares import bounded_weights, descend, first_least
 from hilctl.lab.identify.staged.objective import (
     RADIAN,
-    STAGE_PARAMETERS,
     STEEPEST,
     Layers,
     Parameter,
     Point,
     bounds,
     error_and_slopes,
-    in_loop,
     integrated_model,
     loop_delay_s,
     parameters,
     segments,
     staged_model,
 )
-from hilctl.models.implicit_models import PreisachModel
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.staged import StagedModel
 
@@ -107,12 +96,12 @@ def _point(data: FitData, layers: Layers, weights: F64, knots: F64, x: F64) -> P
 
 def _placed(data: FitData, layers: Layers, point: Point, before: F64, delay_s: float) -> Point:
     """Add the stages; the delay is split between a structure above the data and transport."""
+    if not layers.stages:
+        return replace(point, before=before.copy())
     own_s = delay_s - loop_delay_s(layers.half_period_s, float(before[0]))
-    linear = Linear(max(own_s, 0.0) if layers.delay else 0.0)
-    if layers.structure:
-        q_s = 0.016 / data.top_hz
-        c_s = float(np.clip(own_s, 0.1 * q_s, 0.4 * q_s))
-        linear = Linear(max(own_s - c_s, 0.0) if layers.delay else 0.0, c_s, q_s * q_s)
+    q_s = 0.016 / data.top_hz
+    c_s = float(np.clip(own_s, 0.1 * q_s, 0.4 * q_s))
+    linear = Linear(max(own_s - c_s, 0.0), c_s, q_s * q_s)
     return replace(point, before=before.copy(), linear=linear)
 
 
@@ -166,12 +155,13 @@ def find_staged(job: FitJob, data: FitData, layers: Layers) -> StagedEnd:
     """Minimise the sum of squared, weighted errors over all parameters.
 
     Starts are a grid of the nonlinear parameters, with linear solutions for all weights. The best
-    ones are optimised on few points, and the best of these on all points. Raise DataError if a
-    stage has dynamics, and a record is not steady or sample rates differ.
+    ones are optimised on few points, and the best of these on all points. Raise DataError for
+    stages if a record is not steady or sample rates differ.
     """
     settings, progress = job.settings, job.progress
     scale = weight_roots(job.data, settings.weight_by)
-    _check(data, layers)
+    if layers.stages:
+        _check(data)
     progress(0.0, "weights for a few lags")
     few, few_scale = data.thinned(scale, FEW_POINTS)
     ranked = sorted(_grid(few, layers, few_scale), key=lambda start: start[0])
@@ -199,28 +189,25 @@ def find_staged(job: FitJob, data: FitData, layers: Layers) -> StagedEnd:
     return StagedEnd(point, errors, slopes, free, held, scale, tuple(outcomes))
 
 
-def _check(data: FitData, layers: Layers) -> None:
-    if layers.dynamic and len(data.loops) < len(data.records):
+def _check(data: FitData) -> None:
+    if len(data.loops) < len(data.records):
         raise DataError(
-            "lag, structure and delay need steady loops, but there is a history: omit --whole if "
-            "they repeat, otherwise use a model without stages (--model integrated, or "
-            "--set lag=none --set structure=false --set delay=false)"
+            "--model staged needs steady loops, but there is a history: omit --whole if it "
+            "repeats, otherwise use --model field"
         )
-    if layers.dynamic and len({record.sample_rate_hz for record in data.records}) > 1:
+    if len({record.sample_rate_hz for record in data.records}) > 1:
         raise DataError(
-            "lag, structure and delay need runs at one sample rate, since the delay of a loop "
-            "depends on it"
+            "--model staged needs runs at one sample rate, since the delay of a loop depends on it"
         )
 
 
 def _grid(data: FitData, layers: Layers, scale: F64) -> list[tuple[float, Point]]:
     radian_s = RADIAN / data.top_hz
     limit = layers.spacing_limit(data.reach)
-    lags = [part * radian_s for part in LAGS] if layers.lag else [0.0]
+    lags = [part * radian_s for part in LAGS] if layers.stages else [0.0]
     fastest = data.reach / data.speed
     gammas = [part * fastest for part in GAMMAS] if layers.gamma else [0.0]
-    late = layers.delay or layers.structure
-    delays = [part * radian_s for part in (DELAYS if late else (0.0,))]
+    delays = [part * radian_s for part in DELAYS] if layers.stages else [0.0]
     found = []
     for spacing, lag_s, gamma_s, delay_s in product(SPACINGS, lags, gammas, delays):
         before = np.array([lag_s, 0.0, spacing * limit, gamma_s])
@@ -278,69 +265,28 @@ def _covariance(found: StagedEnd, places: tuple[slice, ...]) -> F64:
     return out
 
 
-SPARE = 0.1  # margin of the command span, of the range of the data
-SMOOTHNESS = 0.2  # weight of differences between neighbouring densities
-
-
-def with_triangle(
-    data: FitData, layers: Layers, point: Point, lines: int, scale: F64
-) -> PreisachModel:
-    """Return a Preisach triangle in place of the plays and deadbands of a point."""
-    low, high = data.input_range
-    thresholds = triangle_thresholds(data, lines)
-    lagged = data.lagged(float(point.before[LAG_S]), float(point.before[GROWTH]))
-    spacing = np.array([0.0, 0.0, 1.0, 0.0])
-    w, outputs, _ = data.plays(spacing, thresholds[1:], np.zeros(lines - 1), lagged)
-
-    def densities(columns: F64, least: F64, table: I64) -> tuple[F64, float]:
-        seen = data.through(columns, in_loop(layers, point))
-        return smooth_densities(seen, data.target_um, scale, least, table, SMOOTHNESS)
-
-    spare = SPARE * (high - low)
-    fields = {"command_span": (low - spare, high + spare), "input_unit": data.unit}
-    return fit_triangle(data, np.column_stack([w, outputs]), densities, fields)[0]
-
-
 def fit_free(job: FitJob) -> FoundModel:
     """Fit the integrated model with free weights, whose thresholds grow unless it is asymmetric."""
-    gamma = job.settings.kind == "integrated"
-    layers = _layers(
-        job.settings, lag=False, growth=False, gamma=gamma, structure=False, delay=False
+    settings, data = job.settings, job.data
+    gamma = settings.kind == "integrated"
+    layers = Layers(
+        settings.plays, settings.deadbands, stages=False, gamma=gamma, offset=settings.offset
     )
-    found = find_staged(job, job.data, layers)
-    return _found(job.data, layers, found, integrated_model(job.data, layers, found.point))
+    found = find_staged(job, data, layers)
+    return _found(data, layers, found, integrated_model(data, layers, found.point))
 
 
 def fit_staged(job: FitJob) -> FoundModel:
-    """Fit hysteresis, lag, structure and delay, then a Preisach triangle if requested."""
+    """Fit hysteresis, lag, structure and delay; raise DataError for histories."""
     settings, data = job.settings, job.data
-    layers = _layers(
-        settings,
-        lag=settings.lag != "none",
-        growth=settings.lag == "growth",
-        gamma=settings.lag == "none",
-        structure=settings.structure,
-        delay=settings.delay,
+    layers = Layers(
+        settings.plays,
+        settings.deadbands,
         half_period_s=data.half_period_s,
-        staged=True,
+        offset=settings.offset,
     )
     end = find_staged(job, data, layers)
-    model = staged_model(data, layers, end.point)
-    found = _found(data, layers, end, model)
-    if settings.hysteresis == "integrated":
-        return found
-    job.progress(0.9, "densities of the Preisach triangle")
-    triangle = with_triangle(data, layers, end.point, settings.lines, end.scale)
-    known = {name: found.parameters[name] for name in STAGE_PARAMETERS if name in found.parameters}
-    errors = {name: error for name, error in found.standard_errors.items() if name in known}
-    held = tuple(name for name in found.at_bound if name in known)
-    known["output_offset_um"] = triangle.output_offset_um
-    model = model.model_copy(update={"hysteresis": triangle})
-    return FoundModel(model, len(known) + settings.lines**2, known, found.starts, errors, held)
-
-
-def _layers(settings: FitSettings, **stages: Any) -> Layers:
-    return Layers(settings.plays, settings.deadbands, offset=settings.offset, **stages)
+    return _found(data, layers, end, staged_model(data, layers, end.point))
 
 
 def _found(

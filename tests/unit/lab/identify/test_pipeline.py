@@ -82,14 +82,15 @@ def test_a_unit_that_was_not_recorded_is_refused():
 
 
 def test_settings_are_checked_together():
-    texts = ["plays=0", "weigths=free", "lag=none", "table.rate_hz=fast", "starts=2.5"]
+    texts = ["plays=0", "weigths=free", "lines=8", "lag=none", "table.rate_hz=fast", "starts=2.5"]
     with pytest.raises(ConfigError) as caught:
         settings_from("ppi", texts)
     problems = {problem.key: str(problem) for problem in caught.value.problems}
-    assert problems.keys() == {"plays", "weigths", "lag", "table.rate_hz", "starts"}
+    assert problems.keys() == {"plays", "weigths", "lines", "lag", "table.rate_hz", "starts"}
     assert problems["plays"] == "--set plays=0: plays: must be >= 1, got 0"
     assert "'weights'" in problems["weigths"]
-    assert "staged" in problems["lag"]
+    assert "preisach" in problems["lines"]
+    assert "--model staged" in problems["lag"]
     with pytest.raises(InputError, match=r"'presach' .*'preisach'"):
         settings_from("presach", [])
 

@@ -35,20 +35,12 @@ def test_published_choices_of_a_kind_are_its_defaults():
     assert FitSettings(kind="rdpi", plays=6).plays == 6
 
 
-def test_staged_models_have_their_stages_unless_left_out():
-    full = FitSettings(kind="staged")
-    assert (full.lag, full.structure, full.delay) == ("growth", True, True)
-    less = FitSettings(kind="staged", lag="none", structure=False, delay=False)
-    assert less.changes() == "lag=none, structure=false, delay=false"
-
-
 @pytest.mark.parametrize(("choices", "reason"), [
-    ({"kind": "integrated", "lag": "plain"}, "not of integrated"),
+    ({"kind": "integrated", "lines": 8}, "not of integrated"),
     ({"kind": "ppi", "deadbands": 8}, "not of ppi"),
     ({"kind": "integrated", "deadbands": 0}, "greater than or equal to 1"),
     ({"kind": "staged", "weights": "exponential"}, "not of staged"),
     ({"kind": "staged", "creep": True}, "not of staged"),
-    ({"kind": "staged", "hysteresis": "preisach", "lag": "none"}, "needs a lag"),
     ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "deadbands"),
     ({"kind": "kp", "plays": "auto"}, "not of kp"),
 ])  # fmt: skip
@@ -77,5 +69,5 @@ def test_rows_have_defaults_limits_and_kinds():
     assert rows["plays"][1] == "1 to 200"
     assert rows["weights"][1] == "exponential, free"
     assert rows["turning_um"][:2] == ["-", ""]
-    assert rows["lag"][2] == "staged"
+    assert rows["lines"][2] == "preisach"
     assert "table.time_column" in rows

@@ -25,10 +25,10 @@ from tests.unit.lab.identify.conftest import OMEGA
 
 @pytest.mark.parametrize(("layers", "before"), [
     (Layers(6, 4, half_period_s=1e-4), [1e-4, 0.3, 0.8, 0.0]),
-    (Layers(6, 4, lag=False, gamma=True, structure=False, delay=False), [0.0, 0.0, 0.8, 2e-4]),
+    (Layers(6, 4, stages=False, gamma=True), [0.0, 0.0, 0.8, 2e-4]),
 ])  # fmt: skip
 def test_derivatives_agree_with_differences(data, layers, before):
-    point = start(data, layers, before, 3e-4 if layers.lag else 0.0)
+    point = start(data, layers, before, 3e-4 if layers.stages else 0.0)
     point = replace(point, weights=point.weights + 0.1)  # a weight of 0 has no relative step
     x = point.pack()
     _, slopes = error_and_slopes(data, layers, point)
@@ -59,7 +59,7 @@ def test_the_longest_lag_leaves_half_a_period_and_none_a_whole_one():
 
 
 HALF_S = 1e-5
-LAYERS = Layers(plays=2, deadbands=1, half_period_s=HALF_S, staged=True)
+LAYERS = Layers(plays=2, deadbands=1, half_period_s=HALF_S)
 RADIAN_S = 1.0 / (2.0 * math.pi * 2000.0)
 POINT = Point(
     before=np.array([1e-4, 0.3, 0.5, 0.0]), linear=Linear(5e-5, 0.3 * RADIAN_S, RADIAN_S**2),
@@ -92,7 +92,7 @@ def test_parameters_are_under_their_published_names():
     assert (found["a_1"], found["a_2"], found["g_0"]) == (1.0, 0.5, 1.0)
     assert found["g_1"] == pytest.approx(-0.2)
     assert found["g_-1"] == pytest.approx(0.2)
-    assert "delay_s" not in parameters(replace(LAYERS, staged=False), POINT)
+    assert "delay_s" not in parameters(replace(LAYERS, stages=False), POINT)
 
 
 def test_a_model_has_the_stages_of_its_point(data):

@@ -1,7 +1,6 @@
 """Lag, hysteresis, structure and delay are found again together from their own loops."""
 
 from dataclasses import replace
-from typing import Any
 
 import numpy as np
 import pytest
@@ -18,10 +17,9 @@ from hilctl.lab.identify.staged.objective import (
     parameters,
 )
 from hilctl.lab.identify.staged.staged_fits import StagedEnd, at_bound, standard_errors
-from hilctl.models.implicit_models import PreisachModel
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, parse_model
-from hilctl.models.staged import FieldLag, StagedModel
+from hilctl.models.staged import FieldLag
 from tests.staged import GRID, fit, start, truth
 
 
@@ -55,30 +53,19 @@ def test_errors_are_those_of_the_run(loops_of):
     assert judge(rigid, loops_of(rigid, GRID)).own_peak_percent < 0.05
 
 
-def test_plain_lag_without_structure_and_delay(loops_of):
-    found = fit(
-        loops_of(truth(lag=FieldLag(tau_s=1e-4)), GRID), lag="plain", structure=False, delay=False
-    )
-    assert found.model.lag.tau_s == pytest.approx(1e-4, rel=0.02)
-    assert found.model.lag.growth_per_unit == 0.0
-    assert found.model.structure is None
-    assert found.model.delay_s == 0.0
-    assert found.own_peak_percent < 0.3
-
-
-def test_without_a_lag_thresholds_grow(loops_of):
-    found = fit(loops_of(truth(delay_s=4e-5), GRID), lag="none", structure=False)
-    assert found.model.lag is None
-    assert found.model.delay_s == pytest.approx(4e-5, abs=2e-6)
-    assert found.parameters["gamma"] < 1e-5
+def test_stages_that_are_not_there_have_no_effect(loops_of):
+    """A plain lag of a rigid rod: whatever is fitted for the other stages."""
+    found = fit(loops_of(truth(lag=FieldLag(tau_s=1e-4)), GRID))
+    late_s = found.model.delay_s
+    late_s += found.model.structure.damping_ratio / (np.pi * found.model.structure.natural_hz)
+    assert found.model.lag.tau_s + late_s == pytest.approx(1e-4, rel=0.02)
     assert found.own_peak_percent < 0.3
 
 
 def test_at_a_low_rate_the_delay_is_that_of_the_sampled_lag(loops_of):
     """At 1 kHz a lag of 0.1 ms is a whole sample late: half of it is no delay of the actuator."""
     slow = [(a, f / 10.0) for a, f in GRID]
-    made = loops_of(truth(lag=FieldLag(tau_s=1e-4)), slow, rate_hz=1000.0)
-    found = fit(made, lag="plain", structure=False)
+    found = fit(loops_of(truth(lag=FieldLag(tau_s=1e-4)), slow, rate_hz=1000.0))
     assert found.model.delay_s < 5e-5
     assert found.own_peak_percent < 1.0
 
@@ -94,39 +81,7 @@ def test_a_low_pass_behind_the_plant_is_a_structure(loops_of):
     assert fit(loops).own_peak_percent < 1.0
 
 
-@pytest.mark.slow
-def test_preisach_triangle_is_nearer_between_known_stages(loops_of):
-    stages: dict[str, Any] = {
-        "lag": FieldLag(tau_s=1e-4, growth_per_unit=0.3),
-        "structure": FirstMode(natural_hz=2300.0, damping_ratio=0.15),
-        "delay_s": 3e-5,
-    }
-    lines = 12
-    edges = np.linspace(-7.0, 7.0, lines + 1)
-    bend = 1.5 - np.tanh(edges[:-1] / 3.0)
-    made = PreisachModel(
-        command_span=(-7.5, 7.5),
-        thresholds=tuple((0.5 * np.arange(lines)).tolist()),
-        lowest=-7.0,
-        cell=float(edges[1] - edges[0]),
-        slopes=tuple(tuple((bend * np.exp(-0.3 * i)).tolist()) for i in range(lines)),
-    )
-    loops = loops_of(StagedModel.around(made, **stages), GRID)
-    plays = fit(loops)
-    triangle = fit(loops, hysteresis="preisach", lines=16)
-    assert triangle.rms_percent < 0.5 * plays.rms_percent
-    assert triangle.model.hysteresis.kind == "preisach"
-    assert triangle.standard_errors.keys() <= triangle.parameters.keys() - {"output_offset_um"}
-    assert parse_model("x.yaml", dump_model(triangle.model)) == triangle.model
-    inverse, rate_hz = triangle.model.inverse(75_000.0), 75_000.0
-    reference_um = 8.0 * np.sin(2.0 * np.pi * 50.0 * np.arange(6000) / rate_hz)
-    command = inverse.process(np.append(reference_um, np.zeros(inverse.preview))[inverse.preview :])
-    back = triangle.model.forward(rate_hz).process(command)
-    error = (back - reference_um)[3000 : -2 * inverse.preview]
-    assert np.max(np.abs(error)) < 0.02 * 16.0
-
-
-LAYERS = Layers(plays=1, deadbands=0, lag=False, structure=False, delay=False)
+LAYERS = Layers(plays=1, deadbands=0, stages=False)
 SIZE, RECORDS, EACH = DYNAMIC + 2 + 3, 40, 30
 POINT = Point(np.zeros(4), Linear(), 1.0, np.ones(1), (1.0, 1.0), np.zeros(0), np.zeros(0), 0.0)
 BY = parameters(LAYERS, POINT)
@@ -181,7 +136,7 @@ def test_whole_histories_and_wrong_choices_are_refused(loops_of):
 
 def test_weights_follow_without_a_search(data):
     """With lag, spacing and delay known, the linear problem alone is within 1 % of the stroke."""
-    layers = Layers(8, 5, structure=False)
+    layers = Layers(8, 5)
     point = start(data, layers, [1e-4, 0.3, 0.5, 0.0], data.half_period_s)
     errors, _ = error_and_slopes(data, layers, point)
     assert np.max(np.abs(errors)) < 0.01 * data.stroke_um
