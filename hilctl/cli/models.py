@@ -1,13 +1,11 @@
 """Commands on models: identify, refine, compare, export-model."""
 
 import json
-from collections.abc import Sequence
 from pathlib import Path
 from typing import Annotated
 
 import typer
 from rich.console import Group, RenderableType
-from rich.table import Table
 
 from hilctl import api
 from hilctl.base.errors import InputError
@@ -23,7 +21,6 @@ from hilctl.cli.options import (
 )
 from hilctl.cli.output import print_result
 from hilctl.lab.comparison.compare import Comparison, headings, notes, table_rows
-from hilctl.lab.identify.model_selection import OrderScore
 from hilctl.lab.identify.pipeline import Identification
 from hilctl.lab.identify.refinement import Refinement
 from hilctl.lab.identify.registry import CATALOGUE
@@ -316,8 +313,6 @@ def print_identification(result: Identification, output: Path | None) -> None:
     fit, held_out = result.fit, result.held_out
     for line in summary(result):
         print(line)
-    if result.orders:
-        print_rich(_orders_table(result.orders))
     if held_out is not None:
         loops = loop_table(held_out.judgement.errors)
         print_rich(table(f"validation: {held_out.how}", *loops, left={"loop"}))
@@ -328,16 +323,6 @@ def print_identification(result: Identification, output: Path | None) -> None:
     if output is not None:
         written = result.verdict.grade != "not a model"
         print(f"model: {output}" if written else f"{output}: not written")
-
-
-def _orders_table(orders: Sequence[OrderScore]) -> Table:
-    rows = [
-        (f"{each.plays}", f"{each.deadbands_a_side}",
-         f"{each.rms_percent:.3f}", f"{each.peak_percent:.2f}")
-        for each in orders
-    ]  # fmt: skip
-    headings = ("plays", "deadbands per side", "rms %", "peak %")
-    return table("errors on validation loops", headings, rows)
 
 
 def render_comparison(comparison: Comparison) -> RenderableType:

@@ -1,4 +1,4 @@
-"""Choose the kind of model, its size and the lag of tables by errors on held-out data.
+"""Choose the kind of model and the lag of tables by errors on held-out data.
 
 A kind is chosen by the geometric mean of its errors by stroke. The rms error of whole histories is
 that of their large motions, and does not show a kind whose small loops are several times worse.
@@ -185,9 +185,6 @@ NEAR = 2.0  # times the least error: a small model of the best kind may have it
 WORTH = 0.95  # of the error: a larger model must be below it, since it slows every run
 LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated", "offset": True})
 """Candidates for steady loops."""
-ORDERS = ((6, 4), (8, 6), (12, 8), (16, 10), (20, 12), (28, 16))
-"""Plays, and deadbands on each side if the model has any."""
-WORTH_SIZE = 1.03  # a larger model must lower the error by more than 3 %
 MOST_LAG = 8  # samples tried
 
 
@@ -202,31 +199,20 @@ class CandidateScore:
 
 
 @dataclass(frozen=True, slots=True)
-class OrderScore:
-    """Errors of one size on held-out data, of the stroke."""
-
-    plays: int
-    deadbands_a_side: int
-    rms_percent: float
-    peak_percent: float
-
-
-@dataclass(frozen=True, slots=True)
 class Selection:
     """Selected settings, their errors on held-out data, and those of everything tried."""
 
     settings: FitSettings
     held_out: HeldOut | None = None
     candidates: tuple[CandidateScore, ...] = ()
-    orders: tuple[OrderScore, ...] = ()
 
 
 def select(request: FitRequest) -> Selection:
-    """Select the open kind or size by held-out errors; raise DataError if data are too few."""
+    """Select the kind, if it is open, by held-out errors; raise DataError if data are too few."""
     settings = request.settings
     if isinstance(settings, IdentifySettings) and settings.auto:
         return _choose_kind(request, settings)
-    return _choose_order(request) if settings.size == "auto" else Selection(settings)
+    return Selection(settings)
 
 
 def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
@@ -276,19 +262,6 @@ def _activation(tried: "_Tried") -> dict[str, Any]:
     return {"activation": True, "plays": 16} if tried.settings.looks_for("activation") else {}
 
 
-def _choose_order(request: FitRequest) -> Selection:
-    """Return the smallest size whose error is near the least."""
-    settings = request.settings
-    sizes = [settings.model_copy(update={"plays": n, "deadbands": k}) for n, k in ORDERS]
-    request.progress(0.0, f"fits of {len(sizes)} sizes with held-out data")
-    errors = _tried(request, [("", size) for size in sizes])
-    if not errors:
-        raise DataError("too few data to hold some out and select the number of plays: set plays=N")
-    most = WORTH_SIZE * min(each.rms_percent for each in errors)
-    best = next(each for each in errors if each.rms_percent <= most)
-    return Selection(best.settings, best.held_out, orders=tuple(each.order for each in errors))
-
-
 @dataclass(frozen=True, slots=True)
 class _Tried:
     name: str
@@ -296,23 +269,15 @@ class _Tried:
     held_out: HeldOut
 
     @property
-    def rms_percent(self) -> float:
-        return self.held_out.judgement.rms_percent
-
-    @property
     def stroke_percent(self) -> float:
         return self.held_out.judgement.stroke_percent
 
     @property
     def candidate(self) -> CandidateScore:
-        peak_percent = self.held_out.judgement.peak_percent
-        return CandidateScore(self.name, self.rms_percent, peak_percent, self.stroke_percent)
-
-    @property
-    def order(self) -> OrderScore:
-        settings = self.settings
-        plays, deadbands = settings.plays, settings.deadbands if settings.has("deadbands") else 0
-        return OrderScore(plays, deadbands, self.rms_percent, self.held_out.judgement.peak_percent)
+        judged = self.held_out.judgement
+        return CandidateScore(
+            self.name, judged.rms_percent, judged.peak_percent, judged.stroke_percent
+        )
 
 
 def _tried(

@@ -16,7 +16,6 @@ from hilctl.lab.identify.model_quality import Verdict, verdict_of
 from hilctl.lab.identify.model_selection import (
     CandidateScore,
     HeldOut,
-    OrderScore,
     Selection,
     held_out_error,
     select,
@@ -76,7 +75,6 @@ class Identification:
     """An identified model, and its errors on held-out data.
 
     Attributes:
-        orders: Errors of each number of plays, if it was selected.
         lag_samples: Assumed lag of tables' displacements in samples.
         understood: Columns and units of each table in words.
     """
@@ -85,7 +83,6 @@ class Identification:
     data: Sequence[Record]
     verdict: Verdict
     held_out: HeldOut | None
-    orders: tuple[OrderScore, ...]
     lag_samples: int
     candidates: tuple[CandidateScore, ...] = ()
     understood: tuple[str, ...] = ()
@@ -96,7 +93,6 @@ class Identification:
             "verdict": self.verdict.to_mapping(),
             "held_out": None if self.held_out is None else self.held_out.to_mapping(),
             **self.fit.to_mapping(),
-            "orders": [asdict(order) for order in self.orders],
             "candidates": [asdict(candidate) for candidate in self.candidates],
             "lag_samples": self.lag_samples,
             "tables": list(self.understood),
@@ -149,9 +145,7 @@ def identify_records(request: FitRequest) -> Identification:
         update["errors_percent"] = {**fit.model.provenance.errors_percent, **figures}
     fit = _with_provenance(fit, update)
     verdict = verdict_of(fit, records, selection.settings, held_out)
-    identification = Identification(
-        fit, records, verdict, held_out, selection.orders, 0, selection.candidates
-    )
+    identification = Identification(fit, records, verdict, held_out, 0, selection.candidates)
     return with_verdict(identification, verdict)
 
 

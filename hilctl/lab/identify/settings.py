@@ -54,6 +54,7 @@ class FitSettings(StrictModel):
         "drags": "removed: --model field fits plays only; --model generalised_duhem has such loops",
         "hysteresis": "removed: --model field has a smaller error than a Preisach triangle",
         "lag": "removed: --model staged fits a growing lag, whose growth may be 0",
+        "size": "removed: set plays, and deadbands if the kind has any",
         "delay": "removed: --model staged fits a delay, which may be 0",
     }
 
@@ -61,7 +62,7 @@ class FitSettings(StrictModel):
     plays: int = _of(
         (*_PLAYS, "generalised", "butterfly", "field"),
         12,
-        "Play operators n; auto selects the number by held-out loops.",
+        "Play operators n.",
         ge=1,
         le=200,
     )
@@ -91,9 +92,6 @@ class FitSettings(StrictModel):
     )
     activation: bool = _of(("field",), False, "Plays creep with the logarithm of time.")
     knots: int = _of(("field",), 24, "Pieces of the output curve.", ge=2, le=60)
-    size: Literal["given", "auto"] = _of(
-        _PLAYS, "given", "auto selects the number of operators by held-out loops."
-    )
     weights: Literal["exponential", "free"] = _of(
         _SEARCHED, "exponential", "Weights a e^(-b i) (3.26, 6.19-6.23), or each weight by itself."
     )
@@ -120,16 +118,12 @@ class FitSettings(StrictModel):
     @model_validator(mode="before")
     @classmethod
     def _published(cls, given: Any) -> Any:
-        """Fill in the defaults of the kind; ``auto`` for a number of operators sets the size."""
+        """Fill in the defaults of the kind."""
         if not isinstance(given, dict):
             return given
-        sized = given.get("plays") == "auto"
-        if sized and "deadbands" in given:
-            raise ValueError("plays=auto selects the number of deadbands too: omit deadbands")
-        kept = {name: value for name, value in given.items() if name != "plays" or not sized}
-        kind = kept.get("kind", "integrated")
+        kind = given.get("kind", "integrated")
         published = PUBLISHED.get(kind, {}) if isinstance(kind, str) else {}
-        return {**published, **({"size": "auto"} if sized else {}), **kept}
+        return {**published, **given}
 
     @field_validator("*")
     @classmethod

@@ -14,7 +14,6 @@ from hilctl.lab.identify.fit_api import FitRequest, ignore_progress
 from hilctl.lab.identify.fit_model import fit_model
 from hilctl.lab.identify.model_selection import (
     LOOPS,
-    ORDERS,
     CandidateScore,
     HeldOut,
     choose_lag,
@@ -225,26 +224,6 @@ def test_candidates_look_for_the_parts_that_are_asked_for(monkeypatch):
         ("generalised_duhem", False, False),
         ("integrated", True, True),
     ]
-
-
-@pytest.mark.slow
-def test_smallest_order_that_is_as_good_is_chosen(loops):
-    """Loops of 6 plays on a noisy sensor are not given 28; every order's error is told."""
-    rng = np.random.default_rng(2)
-    noisy = [
-        replace(loop, displacement_um=loop.displacement_um + rng.normal(0.0, 0.3, 150))
-        for loop in loops
-    ]
-    settings = FitSettings(kind="integrated", weights="free", size="auto")
-    found = select(FitRequest(noisy, settings))
-    chosen, errors = found.settings, found.orders
-    assert [error.plays for error in errors] == [plays for plays, _ in ORDERS]
-    assert chosen.plays <= 12
-    assert chosen.starts == settings.starts
-    least = min(error.rms_percent for error in errors)
-    (own,) = (error for error in errors if error.plays == chosen.plays)
-    assert own.rms_percent <= 1.03 * least
-    assert own.deadbands_a_side == chosen.deadbands
 
 
 @pytest.mark.slow

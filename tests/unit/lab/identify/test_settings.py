@@ -41,20 +41,17 @@ def test_published_choices_of_a_kind_are_its_defaults():
     ({"kind": "integrated", "deadbands": 0}, "greater than or equal to 1"),
     ({"kind": "staged", "weights": "exponential"}, "not of staged"),
     ({"kind": "staged", "creep": True}, "not of staged"),
-    ({"kind": "integrated", "plays": "auto", "deadbands": 4}, "deadbands"),
-    ({"kind": "kp", "plays": "auto"}, "not of kp"),
+    ({"kind": "kp", "plays": 4}, "not of kp"),
 ])  # fmt: skip
 def test_impossible_choices_are_refused(choices, reason):
     with pytest.raises(ValidationError, match=reason):
         FitSettings(**choices)
 
 
-def test_auto_is_a_size_and_a_lag():
-    settings = IdentifySettings(kind="ppi", plays="auto", table={"lag_samples": "auto"})  # type: ignore[arg-type]
-    assert settings.size == "auto"
-    assert settings.plays == 10
+def test_auto_is_a_lag():
+    settings = IdentifySettings(kind="ppi", table={"lag_samples": "auto"})  # type: ignore[arg-type]
     assert settings.table.find_lag
-    assert settings.changes() == "size=auto, table.find_lag=true"
+    assert settings.changes() == "table.find_lag=true"
 
 
 def test_the_unit_is_that_of_the_recordings():
