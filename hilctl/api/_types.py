@@ -1,8 +1,7 @@
 """Types of arguments that several functions accept, and their conversion."""
 
-import json
 import os
-from collections.abc import Mapping, Sequence
+from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
@@ -10,20 +9,6 @@ from hilctl.base.files import already_there
 
 PathLike: TypeAlias = str | os.PathLike[str]
 Paths: TypeAlias = PathLike | Sequence[PathLike]
-Settings: TypeAlias = Mapping[str, object] | Sequence[str]
-"""Overrides of an experiment: values by dotted key, ``{"waveform.frequency_hz": 50.0}``, or
-``key=value`` texts as for ``--set``."""
-
-
-def texts_of(settings: Settings) -> list[str]:
-    """Return settings as ``key=value`` texts.
-
-    Raises:
-        TypeError: YAML cannot represent a value.
-    """
-    if not isinstance(settings, Mapping):
-        return [*settings]
-    return [f"{key}={json.dumps(value, ensure_ascii=False)}" for key, value in settings.items()]
 
 
 def paths_of(paths: Paths) -> list[Path]:

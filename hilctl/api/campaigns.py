@@ -2,16 +2,17 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
+from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
-from hilctl.api._types import PathLike, Settings, path_or_none, runs_folder, texts_of
+from hilctl.api._types import PathLike, path_or_none, runs_folder
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable, is_folder, write_text
 from hilctl.base.table import Column
+from hilctl.base.yaml import Settings, texts_of
 from hilctl.experiment.correction import write_correction
 from hilctl.experiment.load import inputs_of
-from hilctl.lab.ilc.ilc_session import IlcResult, IlcRow, IlcSession
 from hilctl.lab.studies.calibrate import (
     CalibrationFit,
     Origin,
@@ -25,7 +26,6 @@ from hilctl.lab.studies.campaign.campaign_runner import (
     CampaignResult,
     planned_fast,
     planned_in_real_time,
-    prepared,
     run_fast,
     run_series,
 )
@@ -38,14 +38,20 @@ from hilctl.lab.studies.characterise.characterisation_runner import (
 )
 from hilctl.lab.studies.characterise.results import Characterisation, StepRow
 from hilctl.lab.studies.characterise.rig_page import characterisation_page
-from hilctl.lab.studies.step_runner import StudyHost
+from hilctl.lab.studies.learn import IlcResult, IlcRow, IlcSession
+from hilctl.lab.studies.study import StudyHost, run_study
+from hilctl.lab.studies.study_folder import prepared
 from hilctl.recording.run_summary import recordings_in
 from hilctl.run.control.client import finish_dead_runs
-from hilctl.run.start import paced, unpaced, unused
+from hilctl.run.start import unpaced
 
 
 def _nothing(*_ignored: object) -> None:
     pass
+
+
+def _host(*, fast: bool) -> StudyHost:
+    return StudyHost(run=unpaced, real_time=False) if fast else StudyHost()
 
 
 def calibrate_sensor(
@@ -114,9 +120,9 @@ def calibrate_amplifier(
     origin = Origin(datetime.now(UTC).date(), by, reference)
     before = existing_calibration(file, "amplifier", overwrite=overwrite)
     finish_dead_runs()
-    host = StudyHost(run=unpaced if fast else paced, on_progress=on_progress)
-    recording = unused(file.with_name(f"{file.stem}-run.mcap"), "-")
-    found = measure_amplifier(path, texts, recording, origin, host)
+    measured = measure_amplifier(path, texts, f"{file.stem}-run", origin)
+    host = replace(_host(fast=fast), on_progress=on_progress)
+    found = run_study(measured, file.parent, host, resume=False)
     write_calibration(file, found.fitted, before)
     return found
 
@@ -163,7 +169,7 @@ def characterise(
     page = file.with_suffix(".html")
     if page == file:
         raise InputError(f"{file}: is the name of the page: choose another --output, such as .yaml")
-    host = StudyHost(run=unpaced if fast else paced, on_progress=on_progress, on_step=on_step)
+    host = replace(_host(fast=fast), on_progress=on_progress, on_step=on_step)
     measured = CharacterisationRunner(
         Path(experiment), texts_of(settings), chosen, highest_hz, host
     )
@@ -178,10 +184,11 @@ def characterise(
     on_plan(measured.plan)
     if dry_run:
         return None
-    if overwrite:
-        measured.discard()
-    found = measured.characterise(file, overwrite=overwrite)
-    write_text(page, characterisation_page(found), overwrite=True)
+    with prepared(chosen, host.sleep_s, host.on_note):
+        if overwrite:
+            measured.discard()
+        found = measured.characterise(file, overwrite=overwrite)
+        write_text(page, characterisation_page(found), overwrite=True)
     return found
 
 
@@ -224,9 +231,9 @@ def campaign(
         steps = load_campaign(Path(steps), texts_of(settings))
     if scheduler != "none" and not fast:
         raise InputError("scheduler needs fast: runs in real time are sequential")
-    host = StudyHost(on_progress=on_progress, on_step=on_row, on_note=on_note)
+    host = replace(_host(fast=fast), on_progress=on_progress, on_step=on_row, on_note=on_note)
     chosen = path_or_none(folder) or campaign_folder(steps)
-    with nullcontext() if dry_run else prepared(chosen, host):
+    with nullcontext() if dry_run else prepared(chosen, host.sleep_s, host.on_note):
         host.on_progress(0.0, "check every step")
         if fast:
             plan = planned_fast(steps, chosen)
@@ -275,7 +282,9 @@ def learn(
         check_no_input(path, inputs)
     if not overwrite and any(path.suffix == ".mcap" for path in runs):
         raise InputError(f"{chosen}: contains runs: choose another --folder, or use --overwrite")
-    session = IlcSession(Path(experiment), texts_of(settings), chosen, unpaced if fast else paced)
-    learned = session.learn(cycles, on_rows)
-    write_correction(file, learned.correction, overwrite=overwrite)
+    session = IlcSession(Path(experiment), texts_of(settings), chosen)
+    host = _host(fast=fast)
+    with prepared(chosen, host.sleep_s, host.on_note):
+        learned = run_study(session.study(cycles, on_rows), chosen, host, resume=False)
+        write_correction(file, learned.correction, overwrite=overwrite)
     return learned

@@ -6,11 +6,12 @@ from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 
-from hilctl.api._types import PathLike, Paths, Settings, path_or_none, paths_of, texts_of
+from hilctl.api._types import PathLike, Paths, path_or_none, paths_of
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import CommandUnit
+from hilctl.base.yaml import Settings, texts_of
 from hilctl.experiment.load import inputs_of
 from hilctl.lab.comparison import compare as library
 from hilctl.lab.comparison.compare import Comparison

@@ -4,10 +4,11 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilctl.api._types import PathLike, Settings, path_or_none, texts_of
+from hilctl.api._types import PathLike, path_or_none
 from hilctl.base.device import DeviceInfo
 from hilctl.base.files import already_there, exists, write_text
 from hilctl.base.types import CommandUnit
+from hilctl.base.yaml import Settings, texts_of
 from hilctl.experiment.examples import copy_schema
 from hilctl.experiment.load import LoadedExperiment, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment

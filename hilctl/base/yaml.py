@@ -536,6 +536,27 @@ def load_document(path: Path, files: TextFiles | None = None) -> Document:
     return Document(str(path), (files or TextFiles()).read(path))
 
 
+Settings: TypeAlias = Mapping[str, object] | Sequence[str]
+"""Overrides of an experiment: values by dotted key, ``{"waveform.frequency_hz": 50.0}``, or
+``key=value`` texts as for ``--set``."""
+
+
+def texts_of(settings: Settings) -> list[str]:
+    """Return settings as ``key=value`` texts.
+
+    Raises:
+        TypeError: YAML cannot represent a value.
+    """
+    if isinstance(settings, Mapping):
+        return [setting(key, value) for key, value in settings.items()]
+    return [*settings]
+
+
+def setting(key: str, value: object) -> str:
+    """Return the ``key=value`` text that sets a key to a plain value."""
+    return f"{key}={json.dumps(value, ensure_ascii=False)}"
+
+
 class OptionFileError(ConfigError, ValueError):
     """A file that options name breaks rules; a ``ValueError``: validation collects it."""
 

@@ -31,7 +31,6 @@ from hilctl.cli.options import (
 )
 from hilctl.cli.output import print_json, print_result
 from hilctl.experiment.labels import label_settings
-from hilctl.lab.ilc.ilc_session import IlcResult, IlcRow, correction_setting
 from hilctl.lab.studies.campaign.campaign_runner import CampaignResult
 from hilctl.lab.studies.campaign.plan import CampaignPlan
 from hilctl.lab.studies.campaign.steps import (
@@ -42,6 +41,7 @@ from hilctl.lab.studies.campaign.steps import (
     load_campaign,
 )
 from hilctl.lab.studies.campaign.store import CampaignRow
+from hilctl.lab.studies.learn import IlcResult, IlcRow, correction_setting
 from hilctl.lab.studies.multi_run.collect import COMPLETED
 from hilctl.lab.studies.multi_run.varied_parameter import (
     VariedParameter,
@@ -50,8 +50,8 @@ from hilctl.lab.studies.multi_run.varied_parameter import (
     short_value,
     texts_of,
 )
+from hilctl.lab.studies.study import StepStoppedError
 from hilctl.run.control.client import finish_dead_runs
-from hilctl.run.start import StepStoppedError
 
 _RESUMES = "the same command resumes from there"
 Folder = Annotated[

@@ -30,7 +30,7 @@ from hilctl.lab.studies.calibrate import CalibrationFit
 from hilctl.lab.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.lab.studies.characterise.results import Characterisation, StepRow
 from hilctl.lab.studies.characterise.rig_page import HELD_OUT_HEADINGS, figure_rows, held_out_rows
-from hilctl.run.start import StepStoppedError
+from hilctl.lab.studies.study import StepStoppedError
 
 _RESUMES = "the same command resumes from this step"
 calibrate_ = typer.Typer(rich_markup_mode=None)

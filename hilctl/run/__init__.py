@@ -2,7 +2,7 @@
 
 PUBLIC = (
     "assemble", "control.client", "metadata", "probe", "recovery", "result",
-    "run_folder", "safety.manual_safe", "shared.ring", "shared.shared_page", "stalls", "start",
+    "run_folder", "safety.manual_safe", "shared.ring", "shared.shared_page", "start",
     "unpaced",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

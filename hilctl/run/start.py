@@ -147,14 +147,6 @@ def unpaced(
     return run_unpaced(checked, output, overwrite=overwrite)
 
 
-class StepStoppedError(RunError):
-    """A run of a study was stopped by a signal; earlier recordings are kept."""
-
-    def __init__(self, text: str, number: int) -> None:
-        super().__init__(text)
-        self.signal, self.exit_code = number, 128 + number
-
-
 @dataclass(frozen=True, slots=True)
 class RunKey:
     """SHA-256 of a run's experiment, model and correction; the latter are empty without one."""

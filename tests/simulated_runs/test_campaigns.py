@@ -14,11 +14,12 @@ from pathlib import Path
 import numpy as np
 import pytest
 
-from hilctl.lab.studies.campaign.campaign_runner import StudyHost, planned_fast, run_fast
+from hilctl.lab.studies.campaign.campaign_runner import planned_fast, run_fast
 from hilctl.lab.studies.campaign.steps import load_campaign
 from hilctl.lab.studies.multi_run import trend
 from hilctl.lab.studies.multi_run.collect import collect
 from hilctl.lab.studies.multi_run.plots import sheets_of
+from hilctl.lab.studies.study import StudyHost
 from hilctl.recording.reader import read
 from tests.commands import ended, typed
 

@@ -14,17 +14,18 @@ from hilctl.analysis.report import summarize
 from hilctl.lab.studies.characterise.characterisation_runner import (
     CharacterisationRunner,
 )
-from hilctl.lab.studies.step_runner import StudyHost
+from hilctl.lab.studies.study import StudyHost
 from hilctl.recording.reader import read
 from hilctl.run.start import checked_experiment, unpaced
 from hilctl.run.unpaced import run_unpaced
 
 CONFIGS = Path(__file__).parents[2] / "configs"
 RIG = CONFIGS / "terfenol_sine_6a.yaml"
+FAST = StudyHost(run=unpaced, real_time=False)
 
 
 def characterised(path, settings, folder, output):
-    campaign = CharacterisationRunner(path, settings, folder, None, StudyHost(run=unpaced))
+    campaign = CharacterisationRunner(path, settings, folder, None, FAST)
     assert campaign.plan.seconds < 300.0
     return campaign.characterise(output)
 
@@ -70,13 +71,9 @@ def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
 ])  # fmt: skip
 def test_problems_of_a_rig_are_named(tmp_path, setting, code):
     quick = ["sample_rate_hz=20000", "block=20"]
-    campaign = CharacterisationRunner(
-        RIG, [*quick, setting], tmp_path, None, StudyHost(run=unpaced)
-    )
+    campaign = CharacterisationRunner(RIG, [*quick, setting], tmp_path, None, FAST)
     if not code:  # a weak one, but nothing is wrong with it
-        campaign = CharacterisationRunner(
-            RIG, [*quick, setting], tmp_path, 40.0, StudyHost(run=unpaced)
-        )
+        campaign = CharacterisationRunner(RIG, [*quick, setting], tmp_path, 40.0, FAST)
     found = campaign.characterise(tmp_path / "model.yaml")
     assert found.problem_code == code
     assert (tmp_path / "model.yaml").exists() is (code == "")

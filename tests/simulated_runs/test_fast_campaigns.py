@@ -1,7 +1,8 @@
 """Campaigns without real time over several processes: the same as in one."""
 
-from hilctl.lab.studies.campaign.campaign_runner import StudyHost, planned_fast, run_fast
+from hilctl.lab.studies.campaign.campaign_runner import planned_fast, run_fast
 from hilctl.lab.studies.campaign.steps import load_campaign
+from hilctl.lab.studies.study import StudyHost
 from hilctl.recording.reader import read
 from tests.unit.lab.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 

@@ -13,12 +13,12 @@ from hilctl.analysis.report import summarize
 from hilctl.cli.commands import app
 from hilctl.experiment.correction import load_correction
 from hilctl.experiment.load import load_experiment
-from hilctl.lab.ilc.ilc_session import IlcSession
+from hilctl.lab.studies.learn import IlcSession
+from hilctl.lab.studies.study import REPEATS, StudyHost, run_study
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.reader import read
-from hilctl.run.stalls import REPEATS
 from hilctl.run.start import checked_experiment, paced, start_run, unpaced
 from hilctl.run.unpaced import run_unpaced
 
@@ -33,7 +33,9 @@ def at(frequency_hz, *more):
 
 
 def learn(folder, settings, run=unpaced, cycles=20):
-    return IlcSession(SINE, settings, folder, run).learn(cycles, lambda rows: None)
+    host = StudyHost(run=run, real_time=run is paced)
+    session = IlcSession(SINE, settings, folder)
+    return run_study(session.study(cycles, lambda rows: None), folder, host, resume=False)
 
 
 def errors(learned):
@@ -90,10 +92,10 @@ class Late:
 def test_the_delay_of_a_link_is_found(tmp_path):
     """40 samples more of delay are reported as such, and learned away."""
 
-    def late(path, settings, output):
+    def late(path, settings, output, on_part, **_):
         checked = checked_experiment(path, settings)
         loaded = replace(checked.loaded, device=Late(checked.loaded.device, 40))
-        return run_unpaced(replace(checked, loaded=loaded), output)
+        return run_unpaced(replace(checked, loaded=loaded), output, overwrite=True)
 
     plain = learn(tmp_path / "plain", at(100.0))
     behind = learn(tmp_path / "late", at(100.0), run=late)
@@ -105,8 +107,7 @@ def test_the_delay_of_a_link_is_found(tmp_path):
 
 def test_excessive_bandwidth_is_reduced(tmp_path):
     """A correction that would break a limit is not run; smaller steps are."""
-    slow = IlcSession(SINE, at(250.0, "limits.slew_a_per_s=14700.0"), tmp_path, unpaced)
-    learned = slow.learn(8, lambda rows: None)
+    learned = learn(tmp_path, at(250.0, "limits.slew_a_per_s=14700.0"), cycles=8)
     assert "corrections were refused" in learned.reason
     assert "14700 A/s" in learned.reason
     assert min(errors(learned)) < 0.3 * errors(learned)[0]
@@ -170,10 +171,11 @@ def test_the_command_writes_a_correction_that_a_run_uses(tmp_path):
 def test_a_fault_later_on_keeps_what_was_learned(tmp_path):
     runs = []
 
-    def breaks(path, settings, output):
+    def breaks(path, settings, output, *more, **keys):
         runs.append(output.name)
         fault = "device.fault={kind: refused, at_sample: 100}"
-        return unpaced(path, [*settings, fault] if len(runs) >= 3 else settings, output)
+        with_fault = [*settings, fault] if len(runs) >= 3 else settings
+        return unpaced(path, with_fault, output, *more, **keys)
 
     learned = learn(tmp_path, at(100.0), run=breaks)
     assert learned.fault
@@ -184,11 +186,11 @@ def test_a_fault_later_on_keeps_what_was_learned(tmp_path):
 
 
 def test_learning_goes_on_from_a_correction(tmp_path):
-    first = IlcSession(SINE, at(100.0), tmp_path / "a", unpaced).learn(4, lambda rows: None)
+    first = learn(tmp_path / "a", at(100.0), cycles=4)
     file = tmp_path / "a" / "run-04.yaml"
     settings = at(100.0, f"compensator.correction={file}")
     assert load_experiment(SINE, settings).correction is not None
-    second = IlcSession(SINE, settings, tmp_path / "b", unpaced).learn(1, lambda rows: None)
+    second = learn(tmp_path / "b", settings, cycles=1)
     assert errors(second)[0] == pytest.approx(errors(first)[4], rel=0.3)
 
 

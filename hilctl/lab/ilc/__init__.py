@@ -1,4 +1,4 @@
 """Iterative learning control: the error of one run corrects the input of the next."""
 
-PUBLIC = ("ilc_session",)
+PUBLIC = ("cycle", "update")
 """Modules that other rooms import; the others are private."""

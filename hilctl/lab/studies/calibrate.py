@@ -22,11 +22,10 @@ from hilctl.base.formatting import shown_briefly
 from hilctl.base.strict import ValidationError, first_problem
 from hilctl.base.table import Column, Table, open_table
 from hilctl.base.types import F64, I64
-from hilctl.base.yaml import dump, load_document
+from hilctl.base.yaml import dump, load_document, setting
 from hilctl.experiment.load import load_experiment
 from hilctl.lab.studies.characterise.characterisation_runner import without_reference
-from hilctl.lab.studies.step_runner import StudyHost, raise_if_stopped, setting
-from hilctl.recording.reader import read
+from hilctl.lab.studies.study import Study, StudyStep
 from hilctl.signals.cycle_metrics import rms
 
 _HIGHEST_ORDER = 4
@@ -227,12 +226,8 @@ def _averaged(x: F64, y: F64) -> tuple[F64, F64]:
 
 
 def measure_amplifier(
-    experiment: Path,
-    settings: Sequence[str],
-    recording: Path,
-    origin: Origin,
-    host: StudyHost,
-) -> CalibrationFit:
+    experiment: Path, settings: Sequence[str], name: str, origin: Origin
+) -> Study[CalibrationFit]:
     """Step the command within a tenth of its limits, and fit gain and offset of its read-back.
 
     Raise InputError if the experiment is invalid, or its device does not measure; nothing has
@@ -253,17 +248,8 @@ def measure_amplifier(
     dwell = int(max(2.0 * rise, _DWELL_S * rate_hz, _DWELL_SAMPLES))
     steps = {"kind": "step", "unit": unit, "levels": levels.tolist(), "rest": safe}
     times = {"dwell_s": dwell / rate_hz, "rise_s": 0.5 * dwell / rate_hz}
-    result = host.run(
-        experiment,
-        [*settings, setting("waveform", steps | times)],
-        recording,
-        lambda part: host.on_progress(part, "steps"),
-        overwrite=False,
-    )
-    raise_if_stopped("calibrate", result)
-    if result.code != "completed":
-        raise RunError(f"{recording}: {result.reason}")
-    recorded = read(recording)
+    run = yield StudyStep(experiment, [*settings, setting("waveform", steps | times)], name)
+    recorded = run.recording
     start = recorded.segments[0].start
     samples = recorded.samples.part(start, start + dwell * levels.size)
     settled = (samples.index - start) % dwell >= 0.6 * dwell
@@ -290,7 +276,7 @@ def measure_amplifier(
     except ValidationError:
         line = f"{gain:.3g} * command {offset:+.3g} {unit}"
         hint = "Check device.amplifier, device.measure and their wiring"
-        raise RunError(f"{recording}: the read-back is not the command: {line}. {hint}") from None
+        raise RunError(f"{run.path}: the read-back is not the command: {line}. {hint}") from None
     return CalibrationFit(fitted, command, measured, residuals)
 
 

@@ -8,7 +8,7 @@ from pydantic import AfterValidator, BaseModel, ConfigDict, Field, field_validat
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.strict import StrictModel
-from hilctl.base.yaml import Document, commented, dotted, load_document, loc_of
+from hilctl.base.yaml import Document, commented, dotted, load_document, loc_of, texts_of
 
 TEXT = """\
 name: bench
@@ -485,3 +485,12 @@ def read(text, **more):
 def test_ambiguous_unions_are_refused(text, said):
     with pytest.raises(ConfigError, match=said):
         read(f"wave:\n  {text}")
+
+
+def test_values_become_texts_that_yaml_reads_back():
+    given = {"a.b": 1e-7, "name": 'µ "x": y', "list": [1, None, True], "map": {"k": "v"}}
+    texts = ["a.b=1e-07", 'name="µ \\"x\\": y"', "list=[1, null, true]", 'map={"k": "v"}']
+    assert texts_of(given) == texts
+    assert texts_of(("a=1", "b=2")) == ["a=1", "b=2"]
+    with pytest.raises(TypeError):
+        texts_of({"a": object()})

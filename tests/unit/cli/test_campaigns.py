@@ -8,11 +8,11 @@ import pytest
 from hilctl.base.errors import ConfigError
 from hilctl.cli.campaigns import print_campaign, print_row, sweep_document
 from hilctl.experiment.correction import Correction, LearnedCycle
-from hilctl.lab.ilc.ilc_session import IlcResult, IlcRow
 from hilctl.lab.studies.campaign.campaign_runner import CampaignResult
 from hilctl.lab.studies.campaign.plan import planned
 from hilctl.lab.studies.campaign.steps import CampaignStep, load_campaign
 from hilctl.lab.studies.campaign.store import CampaignRow
+from hilctl.lab.studies.learn import IlcResult, IlcRow
 from hilctl.lab.studies.multi_run.digest import RunFigures
 from hilctl.lab.studies.multi_run.varied_parameter import dimensions
 from tests.unit.lab.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
@@ -149,11 +149,12 @@ def learn(monkeypatch, tmp_path, hilctl):
 
     def run(*words, **how):
         class Done:
-            def __init__(self, experiment, settings, folder, run):
-                self.run = run
+            def __init__(self, experiment, settings, folder):
+                pass
 
-            def learn(self, cycles, on_rows):
+            def study(self, cycles, on_rows):
                 on_rows([ROW])
+                yield from ()
                 return IlcResult(CORRECTION, (ROW,), (), "noise floor", **how)
 
         monkeypatch.setattr("hilctl.api.campaigns.IlcSession", Done)

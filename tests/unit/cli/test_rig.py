@@ -12,7 +12,8 @@ from hilctl.base.yaml import load_document
 from hilctl.cli.rig import print_characterisation, print_plan, print_step
 from hilctl.lab.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.lab.studies.characterise.results import Characterisation, StepRow
-from hilctl.run.start import StepStoppedError, unpaced
+from hilctl.lab.studies.study import StepStoppedError
+from hilctl.run.start import unpaced
 from tests.unit.lab.studies.characterise.conftest import experiment, limits, limits_with
 from tests.unit.lab.studies.characterise.test_results import FOUND, identification
 

@@ -6,49 +6,41 @@ to the campaign's folder. The coil starts each such run with the heat that it wo
 steps and their pauses followed each other.
 """
 
+import math
 import tempfile
-from collections.abc import Iterator, Mapping
-from contextlib import contextmanager
-from dataclasses import dataclass, replace
+from collections.abc import Callable, Iterator, Mapping
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 
-from hilctl.base.errors import ConfigError, DataError, HilctlError, InputError, RunError
+from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
 from hilctl.base.files import TextFiles, write_file
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document
-from hilctl.experiment.coil_heat import CoolingCoil
-from hilctl.experiment.device_state import heat_after, heat_before
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 from hilctl.experiment.state_files import MachineTime
 from hilctl.lab.identify.parallel import workers
 from hilctl.lab.studies.campaign.plan import CampaignPlan, PlannedStep, planned
 from hilctl.lab.studies.campaign.steps import CampaignStep, CampaignSteps
-from hilctl.lab.studies.campaign.store import (
-    CampaignRow,
-    await_runs,
-    completed_runs,
-    entry_of,
-    last_started,
-    locked_folder,
-    new_recording,
-    ordered,
-    repair_recordings,
-    write_table,
-)
+from hilctl.lab.studies.campaign.store import CampaignRow, entry_of, ordered, write_table
 from hilctl.lab.studies.multi_run.collect import COMPLETED, series_of
 from hilctl.lab.studies.multi_run.digest import SeriesDrift, digest_of, drift_of
 from hilctl.lab.studies.multi_run.multi_run_page import write_series
-from hilctl.lab.studies.step_runner import StepRunner, StudyHost, raise_if_stopped, require_room
+from hilctl.lab.studies.study import (
+    StepFaultError,
+    StepStoppedError,
+    Study,
+    StudyHost,
+    StudyRun,
+    StudyStep,
+    heat_of,
+    require_room,
+    run_study,
+)
+from hilctl.lab.studies.study_folder import completed_runs, last_started
 from hilctl.recording.reader import read
-from hilctl.recording.recording import Recording
-from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.result import RunResult
-from hilctl.run.start import RunKey, StepStoppedError
 from hilctl.run.unpaced import run_unpaced
-
-HARMLESS = frozenset({"late", "dropped", "invalid_command"})
-"""Codes of faults that are not the device's or the rig's: the next step may succeed."""
 
 _FIRST_PAGE_S = 60.0
 _PAGE_SHARE = 30.0  # pause before the page is written again, over the time to write it
@@ -91,29 +83,87 @@ class CampaignResult:
 
 
 class Campaign:
-    """State of a running campaign, with the steps that are done already: rows, table and page.
+    """A campaign as a study: its rows, table and page.
 
     The table is written after every step. Drawing the page takes seconds: it is written at the end,
     and between steps while that takes a small part of the time.
+
+    Raise InputError without disk space; nothing has moved.
     """
 
-    def __init__(self, plan: CampaignPlan, host: StudyHost) -> None:
+    def __init__(
+        self,
+        plan: CampaignPlan,
+        host: StudyHost,
+        row_of: Callable[[StudyRun], CampaignRow] = lambda run: measured(run.path),
+    ) -> None:
         self.plan = plan
         self.rows: dict[int, CampaignRow] = {}
         self.tables: list[Path] = []
         self._page: Path | None = None
-        self._host = host
+        self._host, self._row_of = host, row_of
         self._next_page_s = host.now().boot_s + _FIRST_PAGE_S
         require_room(plan.folder, plan.megabytes, plan.free_mb)
-        for each in plan.steps:
-            if each.kept is not None:
-                self.add(each, replace(measured(read(each.kept)), kept=True), write=False)
-        self.tables = write_table(plan, self.rows)
 
-    def add(self, each: PlannedStep, row: CampaignRow, *, write: bool = True) -> None:
-        """Add the row of a step and rewrite the table."""
+    def study(self) -> Study[CampaignResult]:
+        """Run the remaining steps; raise InputError if the table cannot be written."""
+        for each in self.plan.steps:
+            if each.kept is not None:
+                run = yield self._step(each, 0.0)
+                self._add(each, replace(measured(run.path), kept=True))
+        self.tables = write_table(self.plan, self.rows)
+        done_s = 0.0
+        try:
+            for each in self.plan.left:
+                yield from self._ran(each, done_s)
+                done_s += each.pause_s + each.seconds
+        except StepStoppedError as error:
+            return self.result(str(error), error.signal)
+        except RunError as error:
+            return self.result(str(error))
+        except KeyboardInterrupt:  # while a run is evaluated
+            self.result()
+            raise
+        return self.result()
+
+    def _step(self, each: PlannedStep, done_s: float) -> StudyStep:
+        config = self.plan.campaign.config
+        return StudyStep(
+            self.plan.campaign.experiment,
+            each.settings,
+            name=f"{config.name}-{each.step.number:04d}",
+            text=each.step.text,
+            repeats=0,  # a stall is marked, and the next call repeats the step
+            cool_to_rms_a=config.cool_down.to_rms_a or math.inf,
+            loaded=each.loaded,
+            heat=each.heat,
+            done_s=done_s,
+        )
+
+    def _ran(self, each: PlannedStep, done_s: float) -> Study[None]:
+        """Run a step and add its row; raise RunError if no further step may run."""
+        try:
+            row = self._row_of((yield self._step(each, done_s)))
+        except ConfigError as error:  # nothing has moved
+            self._add(each, failed("refused", str(error)))
+        except StepFaultError as error:
+            self._add(each, failed("fault", error.result.reason, error.result.path))
+            if not error.harmless:
+                raise
+        except StepStoppedError as error:
+            if error.result is not None:
+                self._add(each, failed("stopped", error.result.reason, error.result.path))
+            raise
+        except (InputError, RunError) as error:
+            self._add(each, failed("fault", str(error)))
+            raise RunError(f"{each.step.text}: {error}") from None
+        else:
+            self._add(each, row)
+
+    def _add(self, each: PlannedStep, row: CampaignRow) -> None:
+        """Add the row of a step, and rewrite the table unless the step was done earlier."""
         self.rows[each.step.number] = row
-        if write:
+        if not row.kept:
             self.tables = write_table(self.plan, self.rows)
             if self._host.now().boot_s >= self._next_page_s:
                 self._write_page()
@@ -139,42 +189,25 @@ class Campaign:
         self._next_page_s = now_s + max(_FIRST_PAGE_S, _PAGE_SHARE * (now_s - start_s))
 
 
-def measured(recording: Recording) -> CampaignRow:
+def measured(path: Path) -> CampaignRow:
     """Return the row of a completed run."""
-    digest = digest_of(recording)
-    return CampaignRow(COMPLETED, digest.figures, recording.path.name, COMPLETED, digest=digest)
+    digest = digest_of(read(path))
+    return CampaignRow(COMPLETED, digest.figures, path.name, COMPLETED, digest=digest)
 
 
-@contextmanager
-def prepared(folder: Path, host: StudyHost) -> Iterator[None]:
-    """Lock a campaign's folder, unless another writes to it, and repair recordings."""
-    with locked_folder(folder, host.sleep_s):
-        await_runs(folder, host.sleep_s)
-        for orphan in recover_dead_runs():
-            host.on_note(f"{orphan.name}: recording was incomplete: {orphan.text}")
-        for text in repair_recordings(folder):
-            host.on_note(text)
-        yield
+def failed(code: str, reason: str, path: Path | None = None) -> CampaignRow:
+    """Return the row of a run that was not completed, with its recording if there is one."""
+    return CampaignRow(f"{code}: {reason}", recording=path.name if path else "", code=code)
 
 
 def planned_in_real_time(campaign: CampaignSteps, folder: Path, now: MachineTime) -> CampaignPlan:
     """Return the plan of a campaign in real time; raise ConfigError if a step is not allowed."""
-    completed, last = completed_runs(folder), last_started(folder)
+    completed = completed_runs(folder)
     plan = planned(campaign, folder, completed, 0.0)
     if not plan.left:
         return plan
-    heat_a2 = _heat_a2(plan.left[0], last, now)
+    heat_a2 = heat_of(plan.left[0].loaded, last_started(folder), now)
     return planned(campaign, folder, completed, heat_a2) if heat_a2 > 0.0 else plan
-
-
-def _heat_a2(each: PlannedStep, last: Path | None, now: MachineTime) -> float:
-    """Return the heat that the last run of the device or the campaign left in the coil, in A^2."""
-    # A simulated device has no history of its own; within a campaign it counts as one rig.
-    config, info = each.loaded.config, each.loaded.device.info
-    heat_a2, _ = heat_before(each.loaded, now)
-    if config.limits.thermal_time_constant_s is None or not info.simulated or last is None:
-        return heat_a2
-    return max(heat_a2, heat_after(last, config, now.unix_s))
 
 
 def run_series(plan: CampaignPlan, host: StudyHost) -> CampaignResult:
@@ -182,92 +215,9 @@ def run_series(plan: CampaignPlan, host: StudyHost) -> CampaignResult:
 
     Raise InputError without disk space, or if the table can't be written; nothing has moved.
     """
-    state = Campaign(plan, host)
-    steps = _Steps(state, host)
-    try:
-        for each in plan.left:
-            steps.run(each)
-    except StepStoppedError as error:
-        return state.result(str(error), error.signal)
-    except RunError as error:
-        return state.result(str(error))
-    except KeyboardInterrupt:  # between two steps
-        state.result()
-        raise
-    return state.result()
-
-
-class _Steps:
-    """Steps of a campaign in real time."""
-
-    def __init__(self, state: Campaign, host: StudyHost) -> None:
-        self._state, self._host, self._plan = state, host, state.plan
-        self._last = last_started(self._plan.folder)
-        self._runner = StepRunner(host, self._plan.seconds + self._plan.pauses_s)
-
-    def run(self, each: PlannedStep) -> None:
-        """Run a step when the coil is cool enough; raise RunError if no further step may run."""
-        heat_a2 = self._cool(each)
-        campaign, text = self._plan.campaign, each.step.text
-        output = new_recording(self._plan.folder, campaign.config.name, each.step.number)
-        try:
-            result = self._runner.run(
-                campaign.experiment, list(each.settings), output, text, each.seconds,
-                overwrite=False, heat_a2=heat_a2,
-            )  # fmt: skip
-        except ConfigError as error:  # nothing has moved
-            self._add(each, "refused", str(error))
-            return
-        except (InputError, RunError) as error:
-            self._add(each, "fault", str(error))
-            raise RunError(f"{text}: {error}") from None
-        self._last = result.path
-        self._runner.done_s += each.pause_s + each.seconds
-        self._take(each, result)
-
-    def _take(self, each: PlannedStep, result: RunResult) -> None:
-        """Add the row of a run; raise as :meth:`run` does."""
-        text = each.step.text
-        if result.code == COMPLETED and not result.stop_signal:
-            recording = read(result.path)
-            if RunKey.of_facts(recording.run) != each.key:
-                raise RunError(
-                    f"{text}: the experiment, or a file it uses, changed during the campaign. "
-                    "Run the campaign again"
-                )
-            self._state.add(each, measured(recording))
-            return
-        self._add(each, "stopped" if result.stop_signal else "fault", result.reason, result.path)
-        raise_if_stopped(text, result)
-        if not is_harmless(result):
-            raise RunError(f"{text}: {result.reason}")
-
-    def _add(self, each: PlannedStep, code: str, reason: str, path: Path | None = None) -> None:
-        name = path.name if path else ""
-        self._state.add(each, CampaignRow(f"{code}: {reason}", recording=name, code=code))
-
-    def _cool(self, each: PlannedStep) -> float:
-        """Wait until the coil is cool enough; return its heat then, in A^2."""
-        now = self._host.now()
-        heat_a2, now_s = _heat_a2(each, self._last, now), now.boot_s
-        # The coil's own model from here on.
-        coil = CoolingCoil(each.loaded.rig, heat_a2, now_s)
-        to_rms_a = self._plan.campaign.config.cool_down.to_rms_a or float("inf")
-        pause_s = coil.pause_s(each.heat, now_s, to_rms_a)
-        self._runner.cool(f"step {each.step.number}", pause_s)
-        return coil.heat_a2(now_s + pause_s)
-
-
-def is_harmless(result: RunResult) -> bool:
-    """Return whether the next step may run after a run that ended by a fault."""
-    if not result.safe:
-        return False
-    try:
-        events = read(result.path).events
-    except DataError:
-        return False
-    codes = {event.code for event in events if event.level == "error"} - {"run_ended"}
-    return bool(codes) and codes <= HARMLESS
+    return run_study(
+        Campaign(plan, host).study(), plan.folder, host, total_s=plan.seconds + plan.pauses_s
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -280,11 +230,11 @@ class FastTask:
     heat_a2: float  # heat of the coil before it, in A^2
 
 
-def run_task(task: FastTask) -> tuple[bytes, CampaignRow, bool]:
+def run_task(task: FastTask) -> tuple[bytes, RunResult | HilctlError, CampaignRow | None]:
     """Run one step on a worker.
 
-    Return its recording, which is empty if it was refused, its row, and whether the next step may
-    run.
+    Return its recording, its result, and its row if it was completed. An error replaces the result
+    if it was refused.
     """
     document = Document("experiment", task.experiment)
     loaded = resolve(document, Path(task.folder), files=TextFiles(task.files))
@@ -293,12 +243,33 @@ def run_task(task: FastTask) -> tuple[bytes, CampaignRow, bool]:
         try:
             result = run_unpaced(check(loaded, task.heat_a2), output)
         except HilctlError as error:
-            return b"", CampaignRow(f"refused: {error}", code="refused"), True
-        content = output.read_bytes()
-        if result.code == COMPLETED:
-            return content, measured(read(output)), True
-        row = CampaignRow(f"{result.code}: {result.reason}", code=result.code)
-        return content, row, is_harmless(result)
+            return b"", error, None
+        row = measured(output) if result.code == COMPLETED else None
+        return output.read_bytes(), result, row
+
+
+@dataclass(frozen=True, slots=True)
+class WorkerRuns:
+    """Results of steps on workers, in the order of the steps, and the rows of those taken."""
+
+    results: Iterator[tuple[bytes, RunResult | HilctlError, CampaignRow | None]]
+    rows: dict[Path, CampaignRow] = field(default_factory=dict)
+
+    def take(
+        self, path: Path, settings: object, output: Path, *_: object, **__: object
+    ) -> RunResult:
+        """Write the recording of the next step; return its result, or raise its error."""
+        content, result, row = next(self.results)
+        if isinstance(result, HilctlError):
+            raise result
+        write_file(output, lambda stream: stream.write(content), overwrite=False)
+        if row is not None:
+            self.rows[output] = replace(row, recording=output.name)
+        return replace(result, path=output)
+
+    def row_of(self, run: StudyRun) -> CampaignRow:
+        """Return the row of a run."""
+        return self.rows.pop(run.path)
 
 
 def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
@@ -314,27 +285,14 @@ def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
 
 def run_fast(plan: CampaignPlan, host: StudyHost, scheduler: str = "none") -> CampaignResult:
     """Run the remaining steps as fast as possible; raise InputError if the disk has no space."""
-    left = plan.left
     with workers(scheduler) as run:
-        state = Campaign(plan, host)
-        runs = run(run_task, [_task(each) for each in left])
-        for number, (each, (content, row, harmless)) in enumerate(zip(left, runs, strict=True), 1):
-            state.add(each, _recorded(plan, each, content, row) if content else row)
-            host.on_progress(number / len(left), f"{len(left) - number} of {len(left)} runs left")
-            if not harmless:
-                return state.result(f"{each.step.text}: {row.result}")
-    return state.result()
+        done = WorkerRuns(run(run_task, [_task(each) for each in plan.left]))
+        host = replace(host, run=done.take, real_time=False)
+        study = Campaign(plan, host, done.row_of).study()
+        return run_study(study, plan.folder, host, total_s=plan.seconds)
 
 
 def _task(each: PlannedStep) -> FastTask:
     loaded = each.loaded
     folder = str(loaded.folder.absolute())  # a link stays, as in the names of the texts
     return FastTask(loaded.yaml_text, dict(loaded.files.texts), folder, each.heat_a2)
-
-
-def _recorded(
-    plan: CampaignPlan, each: PlannedStep, content: bytes, row: CampaignRow
-) -> CampaignRow:
-    path = new_recording(plan.folder, plan.campaign.config.name, each.step.number)
-    write_file(path, lambda stream: stream.write(content), overwrite=False)
-    return replace(row, recording=path.name)

@@ -10,7 +10,7 @@ from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.preflight import check
 from hilctl.lab.studies.campaign.steps import CampaignStep, CampaignSteps, key_of, locs_of
-from hilctl.lab.studies.step_runner import free_mb
+from hilctl.lab.studies.study import free_mb
 from hilctl.run.start import RunKey
 
 _MOST_PROBLEMS = 20

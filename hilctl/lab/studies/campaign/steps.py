@@ -17,12 +17,11 @@ from pydantic import Field
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.strict import StrictModel
-from hilctl.base.yaml import Document, Loc, dotted, load_document
+from hilctl.base.yaml import Document, Loc, dotted, load_document, setting, texts_of
 from hilctl.experiment.conditioning import Condition
 from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.file import Name
 from hilctl.experiment.load import LoadedExperiment, document_with, named_from, resolve
-from hilctl.lab.studies.step_runner import setting
 
 RunOrder = Literal["as_written", "random", "alternating"]
 
@@ -289,7 +288,7 @@ def locs_of(config: CampaignFile, key: str) -> list[Loc]:
 
 
 def _steps(config: CampaignFile, found: Sequence[tuple[Point, int]]) -> Iterator[CampaignStep]:
-    common = [setting("name", config.name), *settings_of(config.set)]
+    common = [setting("name", config.name), *texts_of(config.set)]
     if config.condition is not None:
         common.append(setting("condition", config.condition.model_dump(exclude_unset=True)))
     reference = config.reference_run
@@ -300,12 +299,7 @@ def _steps(config: CampaignFile, found: Sequence[tuple[Point, int]]) -> Iterator
             runs.insert(place, ({}, again, True))
     for number, (point, repeat, is_reference) in enumerate(runs, 1):
         own = reference.set if reference and is_reference else point
-        yield CampaignStep(number, point, repeat, is_reference, (*common, *settings_of(own)))
-
-
-def settings_of(given: Mapping[str, Any]) -> list[str]:
-    """Return keys and values as ``key=value`` texts."""
-    return [setting(key, value) for key, value in given.items()]
+        yield CampaignStep(number, point, repeat, is_reference, (*common, *texts_of(own)))
 
 
 def key_of(text: str) -> str:

@@ -4,16 +4,16 @@ import json
 from collections.abc import Iterator, Sequence
 from contextlib import suppress
 from dataclasses import dataclass, replace
-from functools import cached_property, partial
+from functools import cached_property
 from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.errors import ConfigError, DataError, InputError, RunError
-from hilctl.base.files import check_writable, exists, make_folder, write_text
+from hilctl.base.errors import ConfigError, InputError
+from hilctl.base.files import check_writable, write_text
 from hilctl.base.types import F64
+from hilctl.base.yaml import setting
 from hilctl.experiment.coil_heat import CoilHeat, CoolingCoil, RunHeat
-from hilctl.experiment.device_state import heat_before
 from hilctl.experiment.load import document_with, load_experiment
 from hilctl.lab.identify.data.data_files import MOST_MISSING
 from hilctl.lab.studies.characterise.limits import CharacterisationLimits, limits_of
@@ -27,23 +27,21 @@ from hilctl.lab.studies.characterise.results import (
 )
 from hilctl.lab.studies.characterise.steps import STEPS, CharacterisationStep
 from hilctl.lab.studies.characterise.waveforms import FIRST_PARTS, Keys, at_rest, first_run, within
-from hilctl.lab.studies.step_runner import (
-    StepRunner,
+from hilctl.lab.studies.study import (
+    StepFaultError,
+    Study,
     StudyHost,
+    StudyStep,
     free_mb,
-    raise_if_stopped,
     require_room,
-    setting,
+    run_study,
 )
 from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
 from hilctl.loop.pacer import TIMING_REMEDY
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import dump_model
-from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
-from hilctl.run.result import RunResult
-from hilctl.run.stalls import StallError, fault_of, repeated
-from hilctl.run.start import RunKey, checked_experiment, unpaced
+from hilctl.run.start import checked_experiment
 
 
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
@@ -116,12 +114,11 @@ class CharacterisationRunner:
         self._loaded = load_experiment(experiment, self._settings)
         self.limits = limits_of(self._loaded, highest_hz)
         info = self._loaded.device.info
-        if self._host.run is unpaced and not info.simulated:
+        if not (self._host.real_time or info.simulated):
             raise InputError(f"--fast: {info.name}: only simulated devices run without real time")
         # Reject everything that does not depend on the waveform before anything moves.
         rest = setting("waveform", at_rest(self.limits))
         checked_experiment(experiment, [*self._settings, rest])
-        self._coil = CoolingCoil(self._loaded.rig, 0.0, 0.0)
         self._measured = Measured()
         self._rows: list[StepRow] = []
         self._recordings: dict[str, Path] = {}
@@ -145,10 +142,6 @@ class CharacterisationRunner:
             rows.append(StepRow(step.name, step.purpose, seconds, megabytes))
         return CharacterisationPlan(self.limits, tuple(rows), pauses_s, free_mb(self._folder))
 
-    @cached_property
-    def _runner(self) -> StepRunner:
-        return StepRunner(self._host, self.plan.seconds)
-
     def _heat(self, command: F64) -> RunHeat:
         heat = CoilHeat(self._loaded.config.limits, self.limits.sample_rate_hz, 0.0)
         heat.add(command)
@@ -157,7 +150,7 @@ class CharacterisationRunner:
     def discard(self) -> None:
         """Delete the recordings of all steps."""
         for number, step in enumerate(STEPS, 1):
-            self._path(number, step).unlink(missing_ok=True)
+            (self._folder / f"{_name(number, step)}.mcap").unlink(missing_ok=True)
 
     def characterise(self, output: Path, *, overwrite: bool = False) -> Characterisation:
         """Run all steps, then identify and validate the model and write it to ``output``.
@@ -170,12 +163,15 @@ class CharacterisationRunner:
         """
         check_writable(output, overwrite=overwrite)
         require_room(self._folder, self.plan.megabytes, self.plan.free_mb)
-        make_folder(self._folder)
+        study = self._study(output, overwrite=overwrite)
+        return run_study(study, self._folder, self._host, total_s=self.plan.seconds)
+
+    def _study(self, output: Path, *, overwrite: bool) -> Study[Characterisation]:
         try:
             for number, step in enumerate(STEPS, 1):
                 keys = step.waveform(self.limits, self._measured)
                 if keys is not None:
-                    self._do(number, step, keys)
+                    yield from self._step(number, step, *within(self.limits, keys))
             return self._with_model(output, overwrite=overwrite)
         except RigProblemError as error:
             return replace(self._so_far(), problem=str(error), problem_code=error.code)
@@ -190,101 +186,32 @@ class CharacterisationRunner:
             measured=self._measured,
         )
 
-    def _do(self, number: int, step: CharacterisationStep, keys: Keys) -> None:
-        keys, command = within(self.limits, keys)
-        path = self._path(number, step)
-        settings = self._step_settings(number, step, keys)
-        recording = self._kept(path, settings)
-        kept, heat = recording is not None, self._heat(command)
-        if recording is None:
-            planned = {each.name: each.seconds for each in self.plan.steps}
-            before = list(planned)[: list(planned).index(step.name)]
-            self._runner.done_s = sum(planned[name] for name in before)
-            planned_s = planned[step.name]
-            recording = repeated(partial(self._recorded, step, settings, path, planned_s, heat))
-        if not kept:
-            self._coil.ran(heat, self._host.now().boot_s)
-        self._recordings[step.name] = path
+    def _step(
+        self, number: int, step: CharacterisationStep, keys: Keys, command: F64
+    ) -> Study[None]:
+        names = [each.name for each in self.plan.steps]
+        before = self.plan.steps[: names.index(step.name)]
+        try:
+            run = yield StudyStep(
+                self._experiment,
+                self._step_settings(number, step, keys),
+                name=_name(number, step),
+                text=f"{step.name} ({step.purpose})",
+                replaces=True,
+                flaw=_flaw,
+                heat=self._heat(command),
+                done_s=sum(each.seconds for each in before),
+            )
+        except StepFaultError as error:
+            raise _problem(error) or error from None
+        self._recordings[step.name] = run.path
         seconds = command.size / self.limits.sample_rate_hz
-        megabytes = path.stat().st_size / 1e6
-        row = StepRow(step.name, step.purpose, seconds, megabytes, "", str(path), kept)
+        megabytes = run.path.stat().st_size / 1e6
+        row = StepRow(step.name, step.purpose, seconds, megabytes, "", str(run.path), run.kept)
         self._rows.append(row)
-        self._measured, text = step.take(recording, self.limits, self._measured)
+        self._measured, text = step.take(run.recording, self.limits, self._measured)
         self._rows[-1] = replace(row, text=text)
         self._host.on_step(self._rows[-1])
-
-    def _recorded(
-        self,
-        step: CharacterisationStep,
-        settings: list[str],
-        path: Path,
-        seconds: float,
-        heat: RunHeat,
-    ) -> Recording:
-        if self._host.run is not unpaced:  # without real time there is no coil
-            self._runner.cool(step.name, self._pause_s(heat))
-        text = f"{step.name}: {step.purpose}"
-        try:
-            result = self._runner.run(
-                self._experiment, settings, path, text, seconds, overwrite=True
-            )
-        except InputError as error:
-            if not self._rows:
-                raise
-            raise RunError(f"{step.name} is refused: {error}") from None
-        raise_if_stopped(step.name, result)
-        if result.code != "completed":
-            raise self._fault(step, result, read(path))
-        recording = read(path)
-        if (missing := _missing(recording)) > MOST_MISSING:
-            raise StallError(
-                f"{step.name}: timing not kept: {100.0 * missing:.2g} % of the samples are "
-                f"missing, more than {100.0 * MOST_MISSING:g} %: {TIMING_REMEDY}"
-            )
-        return recording
-
-    def _fault(
-        self, step: CharacterisationStep, result: RunResult, recording: Recording
-    ) -> RunError:
-        """Return the problem of the rig behind a fault, or the fault itself."""
-        codes = {event.code for event in recording.events}
-        text = f"{step.name}: {result.reason}"
-        if "sensor_range" in codes:
-            return RigProblemError(
-                "saturated_sensor", text, "set a wider sensor range, or a narrower limits.stroke_um"
-            )
-        if "sensor_frozen" in codes:
-            return RigProblemError("no_reading", text, "check the sensor and its wiring")
-        return fault_of(text, result, recording, self._loaded.config.safe.at_start)
-
-    def _kept(self, path: Path, settings: list[str]) -> Recording | None:
-        """Return the recording of a step that is done; otherwise None.
-
-        Raise InputError if it was recorded with other settings, not as a consequence of an earlier
-        step that was run again.
-        """
-        if not exists(path):
-            return None
-        try:
-            recording = read(path)
-        except DataError:  # truncated before its first sample
-            return None
-        if recording.end.get("code") != "completed" or _missing(recording) > MOST_MISSING:
-            return None
-        if RunKey.of_facts(recording.run) == RunKey.of(load_experiment(self._experiment, settings)):
-            return recording
-        if all(row.kept for row in self._rows):
-            raise InputError(
-                f"{path} was recorded with other settings: restore them, choose another --folder, "
-                "or replace all recordings with --overwrite"
-            )
-        return None
-
-    def _pause_s(self, heat: RunHeat) -> float:
-        """Return the time to cool after the steps so far and the device's last run."""
-        now = self._host.now()
-        last = CoolingCoil(self._loaded.rig, heat_before(self._loaded, now)[0], now.boot_s)
-        return max(coil.pause_s(heat, now.boot_s) for coil in (self._coil, last))
 
     def _with_model(self, output: Path, *, overwrite: bool) -> Characterisation:
         self._host.on_progress(1.0, "identify")
@@ -312,9 +239,6 @@ class CharacterisationRunner:
                 return (*named, *keys)
         return ()
 
-    def _path(self, number: int, step: CharacterisationStep) -> Path:
-        return self._folder / f"{number:02d}-{step.name}.mcap"
-
     def _step_settings(self, number: int, step: CharacterisationStep, keys: Keys) -> list[str]:
         name = f"{self._loaded.config.name}-{step.name}"[-_NAME_LENGTH:].lstrip("._-")
         settings = [*self._settings, setting("name", name), setting("waveform", keys)]
@@ -322,6 +246,32 @@ class CharacterisationRunner:
             settings.append(f"safe.at_start={self.limits.rest!r}")  # where the previous step ended
         # Noise common to all steps would be fitted.
         return settings + self._loaded.noise_settings(number)
+
+
+def _name(number: int, step: CharacterisationStep) -> str:
+    return f"{number:02d}-{step.name}"
+
+
+def _problem(error: StepFaultError) -> RigProblemError | None:
+    """Return the problem of the rig behind a fault, or None."""
+    codes = {event.code for event in error.events}
+    if "sensor_range" in codes:
+        remedy = "set a wider sensor range, or a narrower limits.stroke_um"
+        return RigProblemError("saturated_sensor", str(error), remedy)
+    if "sensor_frozen" in codes:
+        return RigProblemError("no_reading", str(error), "check the sensor and its wiring")
+    return None
+
+
+def _flaw(recording: Recording) -> str:
+    """Return why too many samples are missing, or an empty text."""
+    missing = _missing(recording)
+    if missing <= MOST_MISSING:
+        return ""
+    return (
+        f"timing not kept: {100.0 * missing:.2g} % of the samples are missing, more than "
+        f"{100.0 * MOST_MISSING:g} %: {TIMING_REMEDY}"
+    )
 
 
 def _missing(recording: Recording) -> float:

@@ -10,7 +10,7 @@ import pytest
 from hilctl.base.calibration import CalibrationFile
 from hilctl.base.errors import DataError, InputError, RunError
 from hilctl.base.yaml import load_document
-from hilctl.lab.studies import calibrate
+from hilctl.lab.studies import study
 from hilctl.lab.studies.calibrate import (
     Origin,
     SensorPoints,
@@ -20,11 +20,11 @@ from hilctl.lab.studies.calibrate import (
     sensor_points,
     write_calibration,
 )
-from hilctl.lab.studies.step_runner import StudyHost
+from hilctl.lab.studies.study import StudyHost, run_study
 from hilctl.recording.reader import read
 from hilctl.run.start import unpaced
 
-HOST = StudyHost(run=unpaced)
+HOST = StudyHost(run=unpaced, real_time=False)
 ORIGIN = Origin(date(2026, 1, 31), "N. N.", "interferometer")
 RIG = Path(__file__).parents[4] / "configs" / "terfenol_sine_6a.yaml"
 TRUE = np.linspace(-100.0, 100.0, 21)
@@ -182,7 +182,7 @@ def test_an_unusable_table_is_refused(tmp_path, text):
 
 def amplifier(tmp_path):
     slow = ("sample_rate_hz=1000", "block=10")
-    return measure_amplifier(RIG, slow, tmp_path / "run.mcap", ORIGIN, HOST)
+    return run_study(measure_amplifier(RIG, slow, "run", ORIGIN), tmp_path, HOST)
 
 
 def spoiled(monkeypatch, gain, offset):
@@ -191,7 +191,7 @@ def spoiled(monkeypatch, gain, offset):
         measured = gain * recording.samples.measured + offset
         return replace(recording, samples=replace(recording.samples, measured=measured))
 
-    monkeypatch.setattr(calibrate, "read", changed)
+    monkeypatch.setattr(study, "read", changed)
 
 
 def test_gain_and_offset_of_the_read_back(tmp_path, monkeypatch):
@@ -214,7 +214,7 @@ def test_a_read_back_without_the_command_is_refused(tmp_path, monkeypatch, gain,
 def test_a_device_that_does_not_measure_is_refused(tmp_path):
     rig = RIG.with_name("modbus_labjack_t7.yaml")
     with pytest.raises(InputError, match=r"device\.measure"):
-        measure_amplifier(rig, (), tmp_path / "run.mcap", ORIGIN, HOST)
+        run_study(measure_amplifier(rig, (), "run", ORIGIN), tmp_path, HOST)
     assert not any(tmp_path.iterdir())
 
 

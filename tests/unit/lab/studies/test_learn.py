@@ -1,17 +1,19 @@
 """Learning over runs that a test makes: what stops it, and what then stands."""
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 import pytest
 
 from hilctl.analysis.report import summarize
-from hilctl.base.errors import ConfigError, InputError, RunError
+from hilctl.base.errors import ConfigError, RunError
 from hilctl.base.segments import Segment
 from hilctl.experiment.correction import Correction, LearnedCycle, load_correction
 from hilctl.lab.ilc.cycle import CycleScore
-from hilctl.lab.ilc.ilc_session import (
+from hilctl.lab.ilc.update import IlcState
+from hilctl.lab.studies.learn import (
     HIGHEST_PART,
     IlcResult,
     IlcSession,
@@ -19,9 +21,8 @@ from hilctl.lab.ilc.ilc_session import (
     repeating,
     row_of,
 )
-from hilctl.lab.ilc.update import IlcState
+from hilctl.lab.studies.study import StudyHost, run_study
 from hilctl.recording.reader import read
-from hilctl.run.result import RunResult
 from hilctl.run.start import checked_experiment, unpaced
 
 SINE = Path(__file__).parents[4] / "configs" / "terfenol_sine_6a.yaml"
@@ -35,16 +36,17 @@ class Runs:
         self.last, self.code, self.stop_signal = last, code, stop_signal
         self.settings = []
 
-    def __call__(self, path, settings, output):
+    def __call__(self, path, settings, output, *_, **__):
         self.settings.append(settings)
+        result = unpaced(path, settings, output)
         if len(self.settings) <= self.last:
-            return unpaced(path, settings, output)
-        unpaced(path, settings, output)
-        return RunResult(output, self.code, "by a test", "confirmed", self.stop_signal, 0, 0, 0)
+            return result
+        return replace(result, code=self.code, reason="by a test", stop_signal=self.stop_signal)
 
 
-def learned(folder, runs, cycles=2):
-    return IlcSession(SINE, SETTINGS, folder, runs).learn(cycles, lambda rows: None)
+def learned(folder, runs, cycles=2, settings=SETTINGS):
+    session, host = IlcSession(SINE, settings, folder), StudyHost(run=runs, real_time=False)
+    return run_study(session.study(cycles, lambda rows: None), folder, host, resume=False)
 
 
 @pytest.mark.slow
@@ -68,8 +70,7 @@ def test_each_run_has_the_next_correction_and_noise_of_its_own(tmp_path):
     "device.output_at_open=3.3",
 ])  # fmt: skip
 def test_samples_before_the_waveform_are_not_evaluated(tmp_path, before):
-    settings = [*SETTINGS, before]
-    (row,) = IlcSession(SINE, settings, tmp_path, Runs(1)).learn(1, lambda rows: None).rows
+    (row,) = learned(tmp_path, Runs(1), 1, [*SETTINGS, before]).rows
     report = summarize(read(Path(row.recording)))
     assert row.error_percent == pytest.approx(report.peak_error_percent)
 
@@ -86,31 +87,9 @@ def test_a_fault_is_one_and_leaves_what_was_learned(tmp_path):
     assert (found.stop_signal, found.fault) == (0, True)
 
 
-def test_a_run_that_a_stall_ends_is_repeated(tmp_path):
-    lost = []
-
-    def run(path, settings, output):
-        fault = [] if lost else ['device.fault={"kind": "sensor_nan", "at_sample": 2000}']
-        result = unpaced(path, [*settings, *fault], output)
-        lost.extend(event.code for event in read(output).events if fault)
-        return result
-
-    found = learned(tmp_path, run, cycles=0)
-    assert ("sensor_invalid" in lost, found.fault) == (True, False)
-    assert [row.run for row in found.rows] == [0]
-
-
 def test_a_first_run_that_fails_is_an_error(tmp_path):
     with pytest.raises(RunError, match="run 0: "):
         learned(tmp_path, Runs(0))
-
-
-def test_a_folder_that_can_not_be_made_is_said_before_a_run(tmp_path):
-    (tmp_path / "file").touch()
-    runs = Runs()
-    with pytest.raises(InputError, match="cannot create"):
-        learned(tmp_path / "file" / "runs", runs)
-    assert runs.settings == []
 
 
 CONFIGS = Path(__file__).parents[4] / "configs"

@@ -1,21 +1,20 @@
 """Session of iterative learning: repeated runs of one experiment, each with a new correction."""
 
-import json
 import signal
 import time
 from collections.abc import Callable, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any, TypeAlias
+from typing import Any
 
 import numpy as np
 
 from hilctl import __version__
 from hilctl.base.errors import ConfigError, HilctlError
-from hilctl.base.files import make_folder
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.segments import Segment
 from hilctl.base.types import C128
+from hilctl.base.yaml import setting
 from hilctl.experiment.correction import (
     Correction,
     LearnedCycle,
@@ -26,11 +25,10 @@ from hilctl.experiment.correction import (
 from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.lab.ilc.cycle import CycleScore, cycle_error, harmonic_count
 from hilctl.lab.ilc.update import IlcState, learn, refused
+from hilctl.lab.studies.study import StepStoppedError, Study, StudyStep
 from hilctl.models.model_file import model_sha256
-from hilctl.recording.reader import read
-from hilctl.run.result import RunResult
-from hilctl.run.stalls import fault_of, repeated
-from hilctl.run.start import StepStoppedError, checked_experiment, paced
+from hilctl.recording.recording import Recording
+from hilctl.run.start import checked_experiment
 
 HIGHEST_PART = 0.125
 """Highest frequency of a correction, as a share of the sample rate."""
@@ -81,14 +79,9 @@ def beginning(checked: CheckedExperiment, segment: Segment) -> IlcState:
     return IlcState(rate_hz, highest_hz, first)
 
 
-Runner: TypeAlias = Callable[[Path, Sequence[str], Path], RunResult]
-"""Function that runs an experiment file with settings and records it."""
-
-
 def correction_setting(file: Path) -> str:
     """Return the ``key=value`` text that selects a correction file."""
-    # Quoted, because "lab #3" would end at the space, and "a: b" would be a mapping.
-    return f"compensator.correction={json.dumps(str(file.resolve()), ensure_ascii=False)}"
+    return setting("compensator.correction", str(file.resolve()))
 
 
 @dataclass(frozen=True, slots=True)
@@ -174,61 +167,56 @@ class IlcSession:
     has no compensator, or no waveform with enough whole steady cycles.
     """
 
-    def __init__(
-        self, experiment: Path, settings: Sequence[str], folder: Path, run: Runner = paced
-    ) -> None:
-        self._experiment, self._settings = experiment, list(settings)
-        self._folder, self._run = folder, run
+    def __init__(self, experiment: Path, settings: Sequence[str], folder: Path) -> None:
+        self._experiment, self._settings, self._folder = experiment, list(settings), folder
         self._checked = checked_experiment(experiment, settings)
         self._segments = repeating(self._checked)
         self._learning = [beginning(self._checked, each) for each in self._segments]
         self._rows: list[IlcRow] = []
         self._refusals: list[str] = []
 
-    def learn(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> IlcResult:
+    def study(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> Study[IlcResult]:
         """Run and learn until the error no longer improves.
 
-        Raises:
-            InputError: The first run is rejected; nothing has moved.
-            RunError: The first run ended by a fault.
+        An error of the first run ends the study; a later one ends the learning.
         """
-        make_folder(self._folder)
         reason, stop_signal, fault = "", 0, False
         check: tuple[IlcRow, ...] = ()
         try:
-            reason = self._runs_until_done(cycles, on_rows)
-            check = self._check()
+            reason = yield from self._runs_until_done(cycles, on_rows)
+            check = yield from self._check()
         except (KeyboardInterrupt, HilctlError) as error:
             if not self._rows:
                 raise
-            stopped = isinstance(error, StepStoppedError | KeyboardInterrupt)
-            fault = not stopped
+            fault = not isinstance(error, StepStoppedError | KeyboardInterrupt)
             stop_signal = 0 if fault else getattr(error, "signal", signal.SIGINT)
             reason = "; ".join(filter(None, (reason, str(error) or "stopped by Ctrl-C")))
         if self._refusals:
             reason += f"; {len(self._refusals)} corrections were refused: {self._refusals[-1]}"
         return IlcResult(self._best(), tuple(self._rows), check, reason, stop_signal, fault)
 
-    def _runs_until_done(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> str:
+    def _runs_until_done(
+        self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]
+    ) -> Study[str]:
         """Run and learn; return the reason for the end."""
         for number in range(cycles + 1):
             try:
-                path = self._next_run(number, [each.next_um for each in self._learning])
+                run = yield self._step(number, [each.next_um for each in self._learning])
             except ConfigError as error:
                 if not self._rows:
                     raise
                 self._refusals.append(str(error))
                 self._learning = [refused(each) for each in self._learning]
             else:
-                rows = self._judge(number, path, learning=True)
+                rows = self._judge(number, run.recording, learning=True)
                 self._rows += rows
                 on_rows(rows)
             if all(each.done for each in self._learning):
                 return "; ".join(sorted({each.done for each in self._learning}))
         return f"no convergence in {cycles} learning cycles: specify more with --cycles"
 
-    def _next_run(self, number: int, coefficients: Sequence[C128]) -> Path:
-        """Run with a correction, which is kept beside the recording; return that."""
+    def _step(self, number: int, coefficients: Sequence[C128]) -> StudyStep:
+        """Return the run with a correction, which is kept beside its recording."""
         name = f"run-{number:02d}"
         file = self._folder / f"{name}.yaml"
         cycles = [
@@ -238,21 +226,9 @@ class IlcSession:
         write_correction(file, self._whole(cycles), overwrite=True)
         noise = self._checked.loaded.noise_settings(number)  # which must not be learned
         settings = [*self._settings, correction_setting(file), *noise]
-        path = self._folder / f"{name}.mcap"
-        return repeated(lambda: self._completed(f"run {number}", settings, path))
+        return StudyStep(self._experiment, settings, name, f"run {number}", replaces=True)
 
-    def _completed(self, name: str, settings: Sequence[str], path: Path) -> Path:
-        result = self._run(self._experiment, settings, path)
-        text = f"{name}: {result.reason}"
-        if result.stop_signal and self._rows:
-            raise StepStoppedError(text, result.stop_signal)
-        if result.code != "completed":
-            at_start = self._checked.loaded.config.safe.at_start
-            raise fault_of(text, result, read(result.path), at_start)
-        return result.path
-
-    def _judge(self, number: int, path: Path, *, learning: bool) -> list[IlcRow]:
-        recording = read(path)
+    def _judge(self, number: int, recording: Recording, *, learning: bool) -> list[IlcRow]:
         # Samples before the waveform: a ramp, a condition, a rest.
         before = recording.segments[0].start - self._checked.reference.segments[0].start
         rows = []
@@ -265,14 +241,14 @@ class IlcSession:
                 if state.done:  # its correction stays while others are learned
                     state = replace(state, next_um=state.best.correction_um)
                 self._learning[i] = state
-            rows.append(row_of(number, segment, error, state, reach_hz, path))
+            rows.append(row_of(number, segment, error, state, reach_hz, recording.path))
         return rows
 
-    def _check(self) -> tuple[IlcRow, ...]:
+    def _check(self) -> Study[tuple[IlcRow, ...]]:
         """Verify the best corrections in another run, with new noise."""
         number = self._rows[-1].run + 1
-        path = self._next_run(number, [each.best.correction_um for each in self._learning])
-        return tuple(self._judge(number, path, learning=False))
+        run = yield self._step(number, [each.best.correction_um for each in self._learning])
+        return tuple(self._judge(number, run.recording, learning=False))
 
     def _best(self) -> Correction:
         cycles = []
