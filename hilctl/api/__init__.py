@@ -40,15 +40,17 @@ if TYPE_CHECKING:
     from hilctl.api.reports import figures, report_page, report_runs
     from hilctl.api.responses import frf, spectrum, step, tune
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
+    from hilctl.api.studies import StepFaultError, StepStoppedError, StudyRun, StudyStep, study
     from hilctl.api.tables import RunTable, SampleTable
 
 __all__ = [
     "ConfigError", "DataError", "DeviceError", "HilctlError", "InputError", "LoadedModel",
     "ModelError", "RecordedRun", "RunConnection", "RunError", "RunTable", "SampleTable",
-    "WrittenExperiment", "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise",
-    "check", "compare", "connect", "export", "export_model", "figures", "frf", "identify", "init",
+    "StepFaultError", "StepStoppedError", "StudyRun", "StudyStep", "WrittenExperiment",
+    "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise", "check", "compare",
+    "connect", "export", "export_model", "figures", "frf", "identify", "init",
     "learn", "list_runs", "load", "load_model", "read", "refine", "replay", "report_page",
-    "report_runs", "run", "spectrum", "step", "summarize", "tune",
+    "report_runs", "run", "spectrum", "step", "study", "summarize", "tune",
 ]  # fmt: skip
 
 
@@ -67,6 +69,7 @@ if not TYPE_CHECKING:
         "reports": {"figures", "report_page", "report_runs"},
         "responses": {"frf", "spectrum", "step", "tune"},
         "runs": {"WrittenExperiment", "check", "init", "load", "run"},
+        "studies": {"StepFaultError", "StepStoppedError", "StudyRun", "StudyStep", "study"},
         "tables": {"RunTable", "SampleTable"},
     }  # fmt: skip
 

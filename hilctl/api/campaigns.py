@@ -2,7 +2,6 @@
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
-from dataclasses import replace
 from datetime import UTC, datetime
 from pathlib import Path
 
@@ -43,15 +42,10 @@ from hilctl.lab.studies.study import StudyHost, run_study
 from hilctl.lab.studies.study_folder import prepared
 from hilctl.recording.run_summary import recordings_in
 from hilctl.run.control.client import finish_dead_runs
-from hilctl.run.start import unpaced
 
 
 def _nothing(*_ignored: object) -> None:
     pass
-
-
-def _host(*, fast: bool) -> StudyHost:
-    return StudyHost(run=unpaced, real_time=False) if fast else StudyHost()
 
 
 def calibrate_sensor(
@@ -121,7 +115,7 @@ def calibrate_amplifier(
     before = existing_calibration(file, "amplifier", overwrite=overwrite)
     finish_dead_runs()
     measured = measure_amplifier(path, texts, f"{file.stem}-run", origin)
-    host = replace(_host(fast=fast), on_progress=on_progress)
+    host = StudyHost.of(fast=fast, on_progress=on_progress)
     found = run_study(measured, file.parent, host, resume=False)
     write_calibration(file, found.fitted, before)
     return found
@@ -169,7 +163,7 @@ def characterise(
     page = file.with_suffix(".html")
     if page == file:
         raise InputError(f"{file}: is the name of the page: choose another --output, such as .yaml")
-    host = replace(_host(fast=fast), on_progress=on_progress, on_step=on_step)
+    host = StudyHost.of(fast=fast, on_progress=on_progress, on_step=on_step)
     measured = CharacterisationRunner(
         Path(experiment), texts_of(settings), chosen, highest_hz, host
     )
@@ -231,7 +225,7 @@ def campaign(
         steps = load_campaign(Path(steps), texts_of(settings))
     if scheduler != "none" and not fast:
         raise InputError("scheduler needs fast: runs in real time are sequential")
-    host = replace(_host(fast=fast), on_progress=on_progress, on_step=on_row, on_note=on_note)
+    host = StudyHost.of(fast=fast, on_progress=on_progress, on_step=on_row, on_note=on_note)
     chosen = path_or_none(folder) or campaign_folder(steps)
     with nullcontext() if dry_run else prepared(chosen, host.sleep_s, host.on_note):
         host.on_progress(0.0, "check every step")
@@ -283,7 +277,7 @@ def learn(
     if not overwrite and any(path.suffix == ".mcap" for path in runs):
         raise InputError(f"{chosen}: contains runs: choose another --folder, or use --overwrite")
     session = IlcSession(Path(experiment), texts_of(settings), chosen)
-    host = _host(fast=fast)
+    host = StudyHost.of(fast=fast)
     with prepared(chosen, host.sleep_s, host.on_note):
         learned = run_study(session.study(cycles, on_rows), chosen, host, resume=False)
         write_correction(file, learned.correction, overwrite=overwrite)

@@ -22,6 +22,9 @@ EXPECTED = {
     "campaign_to_figure": (
         r"(?s)step 1 .*completed.*amplitudes\.csv.*\.mcap\n.*\.mcap", "campaign/figures",
     ),
+    "own_study": (
+        r"A: .*\(run\)[\s\S]*60 µm need \d\.\d+ A\n(\d.*\(done earlier\)\n)+", "own-study",
+    ),
     "matlab_handover": (r"run\.mat: \d+ samples[\s\S]*\nTrue", "handover/run.npz"),
 }  # fmt: skip
 NOTEBOOK = EXAMPLES / "run_to_c.ipynb"

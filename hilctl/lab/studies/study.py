@@ -31,7 +31,7 @@ from dataclasses import dataclass, field
 from datetime import timedelta
 from functools import cached_property, partial
 from pathlib import Path
-from typing import TypeAlias, TypeVar
+from typing import Any, Self, TypeAlias, TypeVar
 
 from hilctl.base.errors import DataError, HilctlError, InputError, RunError
 from hilctl.base.events import Event
@@ -47,7 +47,7 @@ from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.recording.run_summary import read_ends
 from hilctl.run.result import RunResult
-from hilctl.run.start import RunKey, completed_key, paced, unused
+from hilctl.run.start import RunKey, completed_key, paced, unpaced, unused
 
 _log = logging.getLogger(__name__)
 
@@ -164,6 +164,11 @@ class StudyHost:
     on_step: Callable[..., None] = field(default=lambda *result: None)  # with each step's result
     # With a note on each repaired recording.
     on_note: Callable[[str], None] = field(default=lambda text: None)
+
+    @classmethod
+    def of(cls, *, fast: bool, **observers: Any) -> Self:
+        """Return a host in real time, or of simulated devices as fast as possible."""
+        return cls(run=unpaced if fast else paced, real_time=not fast, **observers)
 
 
 def run_study(
