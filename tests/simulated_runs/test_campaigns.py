@@ -299,10 +299,10 @@ class TestFiguresAndTrends:
             ("amplitude", {"loops_by_amplitude", "hysteresis_against_frequency"}),
             ("bias", {"loops_by_bias_current", "hysteresis_against_bias_current"}),
             ("waveforms", {"hysteresis_against_frequency_of_sine_1"}),
-            ("loads", {"frequency_response", "step_response"}),
+            ("loads", {"resonance_against_load"}),
             ("loads_sines", {"loops_by_load", "hysteresis_against_frequency"}),
-            ("compensation", {"before_and_after", "model_against_measured", "error_history"}),
-            ("compensation_complex", {"before_and_after", "error_history"}),
+            ("compensation", {"before_and_after", "model_against_measured"}),
+            ("compensation_complex", {"before_and_after"}),
         ],
     )  # fmt: skip
     def test_each_campaign_has_its_figures(self, series, name, figures):

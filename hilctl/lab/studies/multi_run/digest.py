@@ -1,4 +1,4 @@
-"""Metrics of one run, and its data for figures; drift of reference runs."""
+"""Metrics of one run, and its loops for figures; drift of reference runs."""
 
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field, fields
@@ -16,7 +16,6 @@ from hilctl.base.types import F64
 from hilctl.base.yaml import Document
 from hilctl.lab.identify.data.cycles import loops_from_pieces
 from hilctl.lab.identify.evaluation import judge
-from hilctl.lab.pages.plot_style import min_max
 from hilctl.lab.response.frequency_response import FrequencyResponse, frequency_response
 from hilctl.lab.response.step_response import StepResponse, step_response
 from hilctl.models.base import HysteresisModel
@@ -155,8 +154,6 @@ def drift_of(done: Sequence[RunFigures]) -> SeriesDrift | None:
 
 POINTS = 300  # points per loop
 
-_STEP_POINTS = 800
-_STEP_CYCLES = 12.0  # of the ringing
 _NO_LOOP = np.empty((2, 0))
 
 
@@ -179,14 +176,9 @@ class RunDigest:
     figures: RunFigures
     # float64[2, m], input and displacement, closed; empty without a cycle
     loop: F64 = field(default_factory=_NO_LOOP.copy)
-    # float64[2, m], phase in cycles and error in um, or empty
-    error_um: F64 = field(default_factory=_NO_LOOP.copy)
     # float64[3, m], command, measured and modelled um over a cycle, or empty
     modelled: F64 = field(default_factory=lambda: np.empty((3, 0)))
     model_error_percent: float | None = None  # largest, of the peak-to-peak; None without a model
-    # float64[2, k], time in s and um after the largest step, or empty
-    step: F64 = field(default_factory=_NO_LOOP.copy)
-    response: FrequencyResponse | None = None  # small-signal response, or None
 
     @property
     def is_plain_loop(self) -> bool:
@@ -215,10 +207,6 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
         waveform=worst.label if worst else "",
         figures=_figures(recording, report, worst, structure),
         **(_loop(recording, worst, model) if worst and worst.is_loop else {}),
-        step=_shown_step(recording, structure)
-        if isinstance(structure, StepResponse)
-        else _NO_LOOP.copy(),
-        response=structure if isinstance(structure, FrequencyResponse) else None,
     )
 
 
@@ -235,12 +223,8 @@ def _loop(recording: Recording, segment: Segment, model: HysteresisModel | None)
     part = steady_part(recording, segment)
     if part.cycle is None or not part.loop.size:
         return found
-    phase, (loop_input, output) = part.cycle.phase, part.loop
-    step = max(1, phase.size // POINTS)
-    closed = np.append(part.loop[:, ::step], part.loop[:, :1], axis=1)
-    if recording.compensated:
-        found["error_um"] = np.array((phase, output - loop_input))[:, ::step]
-    return {"loop": closed, **found}
+    step = max(1, part.cycle.phase.size // POINTS)
+    return {"loop": np.append(part.loop[:, ::step], part.loop[:, :1], axis=1), **found}
 
 
 def _modelled(
@@ -262,16 +246,3 @@ def _modelled(
         "modelled": np.append(modelled, modelled[:, :1], axis=1),
         "model_error_percent": found.own_peak_percent,
     }
-
-
-def _shown_step(recording: Recording, found: StepResponse) -> F64:
-    rate_hz = recording.sample_rate_hz
-    begin = round(found.start_s * rate_hz)
-    samples = recording.samples.part(begin, begin + round(found.dwell_s * rate_hz))
-    t = (samples.index - begin) / rate_hz
-    if found.natural_hz is not None:
-        # Few cycles: decimate, because minima and maxima would form a zigzag.
-        part = t <= _STEP_CYCLES / found.natural_hz
-        step = max(1, int(np.count_nonzero(part)) // _STEP_POINTS)
-        return np.array((t[part][::step], samples.displacement_um[part][::step]))
-    return np.array(min_max(t, samples.displacement_um, _STEP_POINTS))

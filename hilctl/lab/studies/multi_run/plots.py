@@ -17,19 +17,18 @@ from hilctl.lab.pages.plot_style import QUIET, plain_numbers
 from hilctl.lab.studies.multi_run.collect import OnRead, RunSeries, SeriesRun
 from hilctl.lab.studies.multi_run.run_plots import (
     before_after_sheet,
-    error_sheet,
-    frequency_sheet,
     looks,
     loop_sheets,
     model_sheet,
     spread,
-    step_sheet,
 )
 from hilctl.lab.studies.multi_run.trend import (
     AREA,
     ASYMMETRY,
+    DAMPING,
     HYSTERESIS,
     MODEL_ERROR,
+    NATURAL,
     PEAK_ERROR,
     RMS_ERROR,
     STROKE,
@@ -68,6 +67,9 @@ def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
         if left and any(run.digest and run.digest.compensated for run in series.done):
             caption = f"Residual errors of compensators and models against {along.name}."
             yield FigureSpec(f"compensation_against_{name}", caption, left)
+        if structure := _trend_panels(series, along, [NATURAL, DAMPING], None):
+            caption = f"Natural frequency and damping ratio against {along.name}."
+            yield FigureSpec(f"resonance_against_{name}", caption, structure)
 
 
 def _trend_panels(
@@ -138,12 +140,9 @@ def sheets_of(series: RunSeries) -> list[FigureSpec]:
     """Return all figures that apply, the most important first."""
     sheets = (
         before_after_sheet(series),
-        frequency_sheet(series),
-        step_sheet(series),
         *trend_sheets(series),
         *loop_sheets(series),
         model_sheet(series),
-        error_sheet(series),
     )
     return [sheet for sheet in sheets if sheet is not None]
 

@@ -1,7 +1,6 @@
-"""Figures of runs side by side: loops, errors, step and frequency responses."""
+"""Loops of runs side by side: by parameter, with and without a compensator, with a model."""
 
-from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence, Sized
-from dataclasses import replace
+from collections.abc import Hashable, Iterator, Mapping, Sequence, Sized
 from functools import partial
 from itertools import cycle
 from typing import Any, TypeAlias, TypeVar
@@ -10,7 +9,7 @@ import matplotlib as mpl
 import numpy as np
 from matplotlib.axes import Axes
 
-from hilctl.base.formatting import quantity, significant
+from hilctl.base.formatting import quantity
 from hilctl.lab.pages.figure_layout import FigureSpec, Panel
 from hilctl.lab.pages.plot_style import (
     DISPLACEMENT,
@@ -21,7 +20,6 @@ from hilctl.lab.pages.plot_style import (
     WITHOUT,
     of_range,
 )  # fmt: skip
-from hilctl.lab.response.bode import response_sheet
 from hilctl.lab.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.lab.studies.multi_run.digest import RunDigest
 from hilctl.lab.studies.multi_run.varied_parameter import (
@@ -200,88 +198,6 @@ def _draw_pair(axes: Axes, before: RunDigest, after: Sequence[tuple[str, RunDige
     axes.set(xlabel="input, % of its range", ylabel="displacement, % of its range")
 
 
-def error_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return the error over one cycle of compensated runs; None without any."""
-    runs = [each for each in series.measured if each[1].error_um.size]
-    if not runs:
-        return None
-    along = next((each for each in series.dimensions if each.numeric), None)
-    groups = []
-    for title, members in _groups(series, along) if along else ():
-        compensated = [each for each in members if each[1].error_um.size]
-        if compensated:
-            groups.append((title, compensated))
-    groups = groups or [("", runs)]
-
-    def text(run: SeriesRun) -> str:
-        value = run.values.get(along.key) if along else None
-        return series.text(run) if along is None or value is None else along.text(value)
-
-    panels = tuple(
-        Panel(partial(_draw_error, text=text, runs=members), title)
-        for title, members in spread(groups, _MOST_PANELS)
-    )
-    caption = "Error over one average cycle: displacement minus reference."
-    return FigureSpec("error_history", caption, panels, alike=len(panels) > 1)
-
-
-def _draw_error(axes: Axes, text: Callable[[SeriesRun], str], runs: Sequence[Measured]) -> None:
-    shown = spread(runs)
-    shades = looks(
-        VariedParameter("", "", "", tuple(map(float, range(len(shown))))), range(len(shown))
-    )
-    for number, (run, digest) in enumerate(shown):
-        colour = shades[number]["color"]
-        axes.plot(*digest.error_um, color=colour, linewidth=0.9, label=text(run))
-    axes.set(xlabel="phase, cycles", ylabel="error, µm", xlim=(0.0, 1.0))
-
-
 def note(axes: Axes, text: str) -> None:
     """Write a text into the upper left corner."""
     axes.text(0.03, 0.97, text, transform=axes.transAxes, va="top", fontsize=7, color=QUIET)
-
-
-def step_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return displacements after a step, one panel per run; None without any."""
-    runs = [each for each in series.measured if each[1].step.size]
-    if not runs:
-        return None
-    panels = tuple(
-        Panel(partial(_draw_step, digest=digest), _title(series, run))
-        for run, digest in spread(runs, _MOST_PANELS)
-    )
-    caption = "Displacement after a step of the command, with natural frequency and damping."
-    return FigureSpec("step_response", caption, panels)
-
-
-def _title(series: RunSeries, run: SeriesRun) -> str:
-    numeric = [each for each in series.dimensions if each.numeric]
-    return texts_of(numeric, run.values) or series.text(run)
-
-
-def _draw_step(axes: Axes, digest: RunDigest) -> None:
-    t, moved = digest.step
-    natural, damping = digest.figures.natural_hz, digest.figures.damping_ratio
-    axes.plot(1e3 * t, moved, color=NAMED[0])
-    axes.set(xlabel="time after the step, ms", ylabel="displacement, µm")
-    if natural and damping is not None:
-        text = f"{quantity(natural, 'Hz')}, damping ratio {significant(damping)}"
-        corner = axes.transAxes
-        axes.text(0.97, 0.06, text, transform=corner, ha="right", fontsize=7, color=QUIET)
-
-
-def frequency_sheet(series: RunSeries) -> FigureSpec | None:
-    """Return small-signal responses, measured and fitted; None without any."""
-    runs = [each for each in series.measured if each[1].response is not None]
-    if not runs:
-        return None
-    shown = spread(runs)
-    along = next((each for each in series.dimensions if each.numeric), None)
-    values = [run.values.get(along.key) if along else _title(series, run) for run, _ in shown]
-    look = looks(along, list(dict.fromkeys(values)))
-    sheet = response_sheet(
-        [digest.response for _, digest in shown if digest.response is not None],
-        [_title(series, run) for run, _ in shown],
-        [look[value]["color"] for value in values],
-    )
-    return replace(sheet, name="frequency_response")

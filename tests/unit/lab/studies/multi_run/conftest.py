@@ -24,12 +24,11 @@ def digest(*, compensated: bool = False, lag: float = 0.2, **keys: Any) -> RunDi
     """Return the digest of a sine of 40 um that lags."""
     moved = 40.0 * np.sin(PHASE - lag)
     wave = (40.0 if compensated else 6.0) * np.sin(PHASE)
-    error_um = np.array((PHASE / (2.0 * np.pi), moved - wave)) if compensated else np.empty((2, 0))
     made = RunDigest(
         name="rig", path="run.mcap", started="2026-11-22T10:00:00+00:00", labels={},
         device="serial_dac", simulated=False, code="completed", reason="waveform completed",
         values={"waveform": {"unit": "A"}}, compensated=compensated, command_unit="A",
-        waveform="sine", figures=RunFigures(), loop=np.array((wave, moved)), error_um=error_um,
+        waveform="sine", figures=RunFigures(), loop=np.array((wave, moved)),
     )  # fmt: skip
     return replace(made, **keys)
 

@@ -2,15 +2,13 @@
 
 from dataclasses import replace
 
-import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.lab.studies.multi_run import plots
 from hilctl.lab.studies.multi_run.collect import RunSeries
 from hilctl.lab.studies.multi_run.digest import RunFigures
-from tests.unit.lab.response.test_bode import SMALL
-from tests.unit.lab.studies.multi_run.conftest import digest, drawn, grown
+from tests.unit.lab.studies.multi_run.conftest import drawn, grown
 
 
 def test_fits_are_drawn_along_frequency_only(crossed):
@@ -43,31 +41,21 @@ def test_they_are_found_from_what_varied(crossed, compensated):
                   "loops_by_amplitude"),
         (compensated, "before_and_after hysteresis_against_frequency "
                       "compensation_against_frequency loops_by_frequency "
-                          "loops_by_frequency_against_reference error_history"),
+                          "loops_by_frequency_against_reference"),
     ):  # fmt: skip
         assert [sheet.name for sheet in plots.sheets_of(series)] == names.split()
 
 
-def series(*runs):
-    return RunSeries("loads", runs, ("waveform.amplitude",))
-
-
-def test_a_step_with_its_resonance():
-    t = np.linspace(0.0, 0.01, 50)
-    ringing = RunFigures(natural_hz=469.5, damping_ratio=0.12)
-    made = digest(step=np.array((t, np.sin(t))), figures=ringing)
-    run = grown(1.0, 10.0, digest=made)
-    axes = drawn(plots.step_sheet(series(run)).panels[0])
-    assert axes.lines[0].get_xdata()[-1] == 10.0
-    assert axes.get_xlabel().endswith(", ms")
-    assert axes.texts[0].get_text() == "470 Hz, damping ratio 0.120"
-
-
-def test_responses_have_the_names_of_their_runs():
-    runs = [grown(a, 10.0, digest=digest(response=SMALL)) for a in (1.0, 2.0)]
-    sheet = plots.frequency_sheet(series(*runs))
-    names = [line.get_label() for line in drawn(sheet.panels[0]).lines[1::2]]
-    assert names == ["1 A", "2 A"]
+def test_resonances_of_steps_and_multisines():
+    runs = []
+    for number, natural_hz in enumerate((2300.0, 470.0), 1):
+        figures = RunFigures(natural_hz=natural_hz, damping_ratio=0.12)
+        values = {"device.load_kg": 3.7 * number}
+        runs.append(grown(1.0, 1.0, number, figures=figures, values=values, digest=None))
+    series = RunSeries("loads", tuple(runs), ("device.load_kg",), is_campaign=True)
+    (sheet,) = plots.sheets_of(series)
+    assert sheet.name == "resonance_against_load"
+    assert drawn(sheet.panels[0]).lines[0].get_ydata().tolist() == [2300.0, 470.0]
 
 
 @pytest.mark.slow

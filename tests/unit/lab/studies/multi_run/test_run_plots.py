@@ -1,4 +1,4 @@
-"""Figures of runs side by side."""
+"""Loops of runs side by side."""
 
 import numpy as np
 import pytest
@@ -8,7 +8,6 @@ from hilctl.lab.pages.plot_style import WITH, WITHOUT
 from hilctl.lab.studies.multi_run.collect import RunSeries
 from hilctl.lab.studies.multi_run.run_plots import (
     before_after_sheet,
-    error_sheet,
     looks,
     loop_sheets,
     model_sheet,
@@ -89,21 +88,8 @@ def test_before_and_after_of_the_same_settings(compensated):
 
 
 def test_runs_of_one_kind_have_no_before_and_after(crossed):
-    for sheet in (before_after_sheet, error_sheet, model_sheet):
+    for sheet in (before_after_sheet, model_sheet):
         assert sheet(crossed) is None
-
-
-def test_errors_of_compensated_runs(compensated):
-    sheet = error_sheet(compensated)
-    axes = drawn(sheet.panels[0])
-    assert labels(axes) == ["1 Hz", "100 Hz"]
-    assert np.ptp(axes.lines[0].get_ydata()) == pytest.approx(80.0 * 2.0 * np.sin(0.01), rel=0.01)
-    assert axes.get_ylabel() == "error, µm"
-
-
-def test_a_run_alone_shows_its_error(compensated):
-    alone = RunSeries("one", compensated.runs[2:3], ())
-    assert len(error_sheet(alone).panels) == 1
 
 
 def test_the_model_s_error_stands_beside_its_loop():
