@@ -50,10 +50,8 @@ from hilctl.lab.studies.multi_run.varied_parameter import (
     short_value,
     texts_of,
 )
-from hilctl.lab.studies.study import StepStoppedError
 from hilctl.run.control.client import finish_dead_runs
 
-_RESUMES = "the same command resumes from there"
 Folder = Annotated[
     Path | None,
     typer.Option(help="Folder for recordings and table; default: NAME in recording.folder."),
@@ -147,15 +145,11 @@ def _run_campaign(
             print_row(varied, step, row)
 
     with progress_bar("campaign", quiet=as_json) as on_progress:
-        try:
-            result = api.campaign(
-                steps, folder, fast=fast, scheduler=scheduler, dry_run=dry_run,
-                on_progress=on_progress, on_plan=on_plan, on_row=on_row,
-                on_note=lambda text: print(f"hilctl: {text}", file=sys.stderr),
-            )  # fmt: skip
-        except KeyboardInterrupt:  # between two runs, or while the coil cools
-            text = f"stopped by Ctrl-C between two steps; {_RESUMES}"
-            raise StepStoppedError(text, signal.SIGINT) from None
+        result = api.campaign(
+            steps, folder, fast=fast, scheduler=scheduler, dry_run=dry_run,
+            on_progress=on_progress, on_plan=on_plan, on_row=on_row,
+            on_note=lambda text: print(f"hilctl: {text}", file=sys.stderr),
+        )  # fmt: skip
     if result is not None:
         _finish(result, as_json=as_json)
 
@@ -163,7 +157,8 @@ def _run_campaign(
 def _finish(result: CampaignResult, *, as_json: bool) -> None:
     print_result(result_mapping(result), lambda: print_campaign(result), as_json=as_json)
     if result.stop_signal:
-        print(f"hilctl: stopped: {result.reason}; {_RESUMES}", file=sys.stderr)
+        text = f"{result.reason}; the same command resumes from there"
+        print(f"hilctl: stopped: {text}", file=sys.stderr)
         raise typer.Exit(128 + result.stop_signal)
     if result.reason:
         print(f"hilctl: fault: {result.reason}", file=sys.stderr)

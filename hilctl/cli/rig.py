@@ -1,7 +1,6 @@
 """Commands that measure a rig: calibrate, characterise."""
 
 import shlex
-import signal
 import sys
 from pathlib import Path
 from typing import Annotated, Any
@@ -30,7 +29,6 @@ from hilctl.lab.studies.calibrate import CalibrationFit
 from hilctl.lab.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.lab.studies.characterise.results import Characterisation, StepRow
 from hilctl.lab.studies.characterise.rig_page import HELD_OUT_HEADINGS, figure_rows, held_out_rows
-from hilctl.lab.studies.study import StepStoppedError
 
 _RESUMES = "the same command resumes from this step"
 calibrate_ = typer.Typer(rich_markup_mode=None)
@@ -153,8 +151,6 @@ def characterise(
                 on_progress=on_progress, on_plan=on_plan,
                 on_step=(lambda row: None) if as_json else print_step,
             )  # fmt: skip
-    except KeyboardInterrupt:
-        raise StepStoppedError(f"stopped by Ctrl-C; {_RESUMES}", signal.SIGINT) from None
     except RunError as error:
         error.add_note(_RESUMES)
         raise

@@ -199,7 +199,7 @@ def run_study(
             try:
                 run = engine.run(step)
             except KeyboardInterrupt:  # between two runs: a run has its own handler
-                stopped = StepStoppedError(f"{engine.text}: stopped by Ctrl-C", signal.SIGINT)
+                stopped = engine.interrupted()
                 go_on = partial(study.throw, stopped)
             except HilctlError as error:
                 stopped = error if isinstance(error, StepStoppedError) else None
@@ -209,6 +209,8 @@ def run_study(
     except StopIteration as end:
         found: _T = end.value
         return found
+    except KeyboardInterrupt:  # while the study evaluates a run
+        raise engine.interrupted() from None
     except InputError as error:
         if not engine.moved:
             raise
@@ -250,6 +252,10 @@ class _Engine:
                     raise
                 _log.warning("%s; the run is repeated (%d of %d)", error, number, step.repeats)
         return self._recorded(step, loaded, key, file)
+
+    def interrupted(self) -> StepStoppedError:
+        """Return the error for Ctrl-C while no run is active."""
+        return StepStoppedError(f"{self.text}: stopped by Ctrl-C", signal.SIGINT)
 
     def _kept(self, step: StudyStep, key: RunKey, file: Path) -> StudyRun | None:
         """Return an earlier run of a step, which counts once; None without one."""

@@ -97,7 +97,6 @@ def test_invalid_model_has_exit_code_1(ends, command):
 
 @pytest.mark.parametrize(("error", "code"), [
     (StepStoppedError("rest: stopped", 15), 143),
-    (KeyboardInterrupt(), 130),
     (RunError("slow-loops: the cable was pulled"), 3),
 ])  # fmt: skip
 def test_message_of_a_stop_or_fault_says_how_to_resume(ends, command, error, code):

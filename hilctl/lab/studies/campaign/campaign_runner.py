@@ -7,6 +7,7 @@ steps and their pauses followed each other.
 """
 
 import math
+import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, field, replace
@@ -122,8 +123,7 @@ class Campaign:
         except RunError as error:
             return self.result(str(error))
         except KeyboardInterrupt:  # while a run is evaluated
-            self.result()
-            raise
+            return self.result("stopped by Ctrl-C", signal.SIGINT)
         return self.result()
 
     def _step(self, each: PlannedStep, done_s: float) -> StudyStep:

@@ -193,6 +193,16 @@ def test_a_stopped_study_runs_no_further_step(experiment, tmp_path, ends, number
     assert len(rig.runs) == 1
 
 
+def test_an_interrupted_evaluation_stops_the_study(experiment, tmp_path):
+    def evaluated(experiment):
+        yield StudyStep(experiment)
+        raise KeyboardInterrupt
+
+    with pytest.raises(StepStoppedError) as caught:
+        run_study(evaluated(experiment), tmp_path, Rig().host)
+    assert caught.value.exit_code == 130
+
+
 def test_an_experiment_that_changes_meanwhile_ends_the_study(steps, experiment, tmp_path):
     class Changing(Rig):
         def __call__(self, path, *given, **more):
