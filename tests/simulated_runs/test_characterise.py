@@ -88,7 +88,7 @@ def test_a_campaign_that_is_killed_loses_one_step(tmp_path):
     third = tmp_path / "runs" / "05-response-1.mcap"
 
     def begun():
-        return third.exists() and third.stat().st_size > 3000
+        return third.exists() and third.stat().st_size > 20_000  # samples, not the header alone
 
     def until(ready):
         process = subprocess.Popen(words, stdout=subprocess.PIPE, text=True, env=os.environ)
