@@ -9,7 +9,7 @@ from hilctl.base.errors import ConfigProblem, broken
 from hilctl.base.segments import Segment
 from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.experiment.rig import RunRig
-from hilctl.loop.triggers import Level, MarkKind, Triggers, marks_of
+from hilctl.loop.triggers import SHORTEST_CYCLE, Level, MarkKind, Triggers, marks_of
 
 
 class Trigger(StrictModel):
@@ -19,7 +19,6 @@ class Trigger(StrictModel):
         output: Marks of the waveform with which ``device.digital_output`` is high for one sample:
             the start of each ``cycle``, of each ``segment`` (part of a sequence), or of the ``run``
             (its waveform). Default: no pulses.
-        pulse_samples: Samples for which a pulse is high; marks must be further apart.
         start: Level of ``device.digital_input`` with which the run starts; the output is at the
             safe value until then. Default: the run starts immediately.
         timeout_s: Longest wait for that level; then the run ends with the event
@@ -27,7 +26,6 @@ class Trigger(StrictModel):
     """
 
     output: MarkKind | None = None
-    pulse_samples: Annotated[int, Field(ge=1, le=1000)] = 1
     start: Level | None = None
     timeout_s: Annotated[float, Field(gt=0.0, le=86400.0)] = 60.0
 
@@ -39,8 +37,7 @@ class Trigger(StrictModel):
 
     def of(self, segments: Sequence[Segment]) -> Triggers:
         """Return the triggers of a run with these segments of the waveform."""
-        marks = marks_of(self.output, segments)
-        return Triggers(marks, self.start, self.timeout_s, self.pulse_samples)
+        return Triggers(marks_of(self.output, segments), self.start, self.timeout_s)
 
 
 def trigger_problems(trigger: Trigger | None, rig: RunRig) -> Iterator[ConfigProblem]:
@@ -66,6 +63,6 @@ def mark_problems(trigger: Trigger | None, segments: Sequence[Segment]) -> Itera
     if not marks.size:
         rule = "must be segment or run: no part of the waveform is periodic"
         yield broken("trigger.output", rule, trigger.output)
-    elif np.diff(marks).min(initial=trigger.pulse_samples + 1) <= trigger.pulse_samples:
-        rule = f"must be {trigger.pulse_samples + 1} samples or more apart: raise sample_rate_hz"
+    elif np.diff(marks).min(initial=SHORTEST_CYCLE) < SHORTEST_CYCLE:
+        rule = f"must be {SHORTEST_CYCLE} samples or more apart: raise sample_rate_hz"
         yield broken("trigger.output", rule, trigger.output)

@@ -15,6 +15,8 @@ from hilctl.base.types import I64
 MarkKind: TypeAlias = Literal["cycle", "segment", "run"]
 Level: TypeAlias = Literal["high", "low"]
 
+SHORTEST_CYCLE = 2
+"""Shortest distance of marks in samples: the output is high for one and low for one."""
 _ROUNDING = 1e-6  # of a sample: must not add a cycle, or delay one
 
 
@@ -26,19 +28,15 @@ class Triggers:
         marks: int64[m], samples of the waveform with which the digital output is set, in order.
         start: Level of the digital input that starts the run; None: the run starts immediately.
         timeout_s: Longest wait for it.
-        pulse_samples: Samples for which a pulse is high.
     """
 
     marks: I64
     start: Level | None = None
     timeout_s: float = math.inf
-    pulse_samples: int = 1
 
     def pulses(self, device: DigitalDevice, waveform_at: int) -> "PulseOutput | None":
         """Return the digital output of a run, whose waveform begins at a sample; None without."""
-        if not self.marks.size:
-            return None
-        return PulseOutput(device, self.marks + waveform_at, self.pulse_samples)
+        return PulseOutput(device, self.marks + waveform_at) if self.marks.size else None
 
 
 def marks_of(kind: MarkKind | None, segments: Iterable[Segment]) -> I64:
@@ -60,9 +58,9 @@ class PulseOutput:
         marks: int64[m], samples of the run, in order.
     """
 
-    def __init__(self, device: DigitalDevice, marks: I64, samples: int = 1) -> None:
-        self._device, self._marks, self._samples = device, marks, samples
-        self._high, self._ends = False, 0
+    def __init__(self, device: DigitalDevice, marks: I64) -> None:
+        self._device, self._marks = device, marks
+        self._high = False
         self._due = self._next(-1)
 
     def follow(self, sample: int, *, active: bool) -> bool:
@@ -71,16 +69,13 @@ class PulseOutput:
         A mark in skipped ticks is due in the next one. Without ``active`` the output is reset.
         """
         # Low for at least one tick, also between a delayed mark and the next one.
-        rises = not self._high and sample >= self._due
-        if rises:
-            self._ends = sample + self._samples
-        high = active and (rises or (self._high and sample < self._ends))
+        high = active and not self._high and sample >= self._due
         if high != self._high:
             self._device.set_digital(high)
             self._high = high
-        if high and rises:
+        if high:
             self._due = self._next(sample)
-        return high and rises
+        return high
 
     def _next(self, sample: int) -> int:
         """Return the first mark after a sample."""

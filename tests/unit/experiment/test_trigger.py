@@ -44,10 +44,3 @@ def test_triggers_need_channels_and_blocks_of_one_sample(settings, info, keys):
     problems = [*trigger_problems(trigger, replace(rig, info=replace(rig.info, **info)))]
     assert [each.key for each in problems] == keys
     assert all(each.hint or "must be 1" in each.rule for each in problems)
-
-
-def test_marks_closer_than_a_pulse_are_refused():
-    long = ("trigger={output: cycle, pulse_samples: 1000}",)
-    (problem,) = refusals(CURRENT, *long, digital_output="DO")
-    assert problem.key == "trigger.output"
-    assert checked(CURRENT, long[0].replace("1000", "999"), digital_output="DO")

@@ -111,13 +111,6 @@ def test_a_pulse_of_one_sample_at_each_mark():
     assert rig.flagged == [0, 10, 12, 39]
 
 
-def test_a_longer_pulse_is_flagged_at_its_mark():
-    rig = Rig(marks=np.array([0, 10]), pulse_samples=3)
-    rig.run()
-    assert rig.device.pulses == [(0, True), (3, False), (10, True), (13, False)]
-    assert rig.flagged == [0, 10]
-
-
 def test_marks_follow_the_initial_ramp():
     rig = Rig(marks=np.array([0]), device=DigitalDouble(output_at_open=1.0))
     ramp = rig.loop.begin_at([1.0])
