@@ -53,7 +53,8 @@ def test_every_error_passes_from_process_to_process():
     for kind in subclasses(HilctlError):
         own = isinstance(kind.__init__, FunctionType)
         names = [*signature(kind).parameters] if own else ["text"]
-        error = kind(*(values.get(name, f"a {name}") for name in names))
+        given = {name: values.get(name, f"a {name}") for name in names}
+        error = kind(**given) if own else kind(*given.values())
         error.add_note("a note")
         again = pickle.loads(pickle.dumps(error))
         assert (type(again), str(again), vars(again)) == (kind, str(error), vars(error))
