@@ -144,9 +144,9 @@ def _watched() -> Iterator[None]:
 def _detach(
     experiment: Path, output: Path | None, settings: list[str], flags: list[str], *, as_json: bool
 ) -> None:
-    finding = log_out(Machine())
-    if finding.level != "ok":
-        _log.warning("a log-out %s: %s", finding.text, finding.remedy)
+    effect, remedy = log_out(Machine())
+    if remedy:
+        _log.warning("a log-out %s: %s", effect, remedy)
     started = start_detached(experiment, settings, output, flags)
     facts = {"recording": str(started.recording), "log": str(started.log)}
     if as_json:

@@ -1,7 +1,8 @@
 """Diagnosis of this computer: checks, and measured timer latency.
 
-The checks are of kernel, user limits, CPUs, clocks, serial ports, disks and log-out, each a
-function of a :class:`~hilctl.machine.procfs.Machine`.
+A check of a :class:`~hilctl.machine.procfs.Machine` returns what it found and a remedy, which is
+empty if there is nothing to do. What the loop's own set-up shows (priority, locked memory, idle
+states, the CPU) is no check: the measurement includes its steps, and a recording has them too.
 """
 
 import os
@@ -9,260 +10,163 @@ import re
 from collections.abc import Callable
 from dataclasses import asdict, dataclass
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 
 from hilctl.base.types import I64
-from hilctl.machine.procfs import CAP_IPC_LOCK, Finding, Machine
-from hilctl.machine.rt_setup import (
-    DMA_REMEDY,
-    GROUP_REMEDY,
-    ISOLATED,
-    MEMORY_REMEDY,
-    PRIORITY_REMEDY,
-    RT_PERIOD,
-    RT_RUNTIME,
-    Realtime,
-    cpu_numbers,
-    rt_group_runtime_us,
-)
-from hilctl.machine.syscalls import DMA_LATENCY
+from hilctl.machine.procfs import Finding, Level, Machine
+from hilctl.machine.rt_setup import ISOLATED, Realtime, cpu_numbers
 from hilctl.machine.timer_latency import Latency, measure
 
-_CAP_SYS_NICE = 23
-_ENOUGH_LOCKED_BYTES = 1 << 30
 _DYNAMIC = "/sys/kernel/debug/sched/preempt"
 _CPU = "/sys/devices/system/cpu"
 _SERIAL = ("/dev/ttyUSB*", "/dev/ttyACM*")
 _SERIAL_DAEMONS = ("ModemManager", "brltty")
 _LATENCY_TIMERS = "/sys/bus/usb-serial/devices/*/latency_timer"
-_LONG_LATENCY_MS = 1
-_LITTLE_SPACE_BYTES = 1 << 30
+_CLOCK_SOURCE = "/sys/devices/system/clocksource/clocksource0/current_clocksource"
 _STEADY_CLOCKS = ("tsc", "arch_sys_counter", "kvm-clock")
+_LITTLE_SPACE_BYTES = 1 << 30
 _LOGIND_FOLDERS = ("/usr/lib/systemd", "/usr/local/lib/systemd", "/run/systemd", "/etc/systemd")
 """Folders of its settings; later ones take precedence."""
 _SYSTEM_USERS = 999
 _NO = {"no", "n", "false", "f", "off", "0"}
 _THIS_MACHINE = Machine()
 
+_Found: TypeAlias = tuple[str, str]
 
-def preemption(machine: Machine) -> Finding:
+
+def preemption(machine: Machine) -> _Found:
     """Check the kernel's preemption model; PREEMPT_RT is best."""
     version = machine.text("/proc/version") or ""
     if machine.text("/sys/kernel/realtime") == "1" or "PREEMPT_RT" in version:
-        return Finding("kernel", "ok", "PREEMPT_RT")
+        return "PREEMPT_RT", ""
     remedy = "install a PREEMPT_RT kernel (Debian: linux-image-rt-amd64, or -arm64)"
-    if "PREEMPT_DYNAMIC" in version:
-        chosen = re.search(r"\((\w+)\)", machine.text(_DYNAMIC) or "")
-        asked = re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline") or "")
-        mode = (chosen or asked or [""] * 2)[1]
-        if mode == "full":
-            return Finding("kernel", "warn", "PREEMPT_DYNAMIC, full preemption", remedy)
-        known = f"{mode} preemption" if mode else "preemption mode not readable"
-        text = f"PREEMPT_DYNAMIC, {known}"
-        return Finding("kernel", "warn", text, f"boot with preempt=full, or {remedy}")
-    model = "PREEMPT" if "PREEMPT" in version else "no preemption"
-    return Finding("kernel", "warn", model, remedy)
+    if "PREEMPT_DYNAMIC" not in version:
+        return "PREEMPT" if "PREEMPT" in version else "no preemption", remedy
+    chosen = re.search(r"\((\w+)\)", machine.text(_DYNAMIC) or "")
+    asked = re.search(r"\bpreempt=(\w+)", machine.text("/proc/cmdline") or "")
+    if not (mode := chosen or asked):
+        return (
+            "PREEMPT_DYNAMIC, preemption mode not readable",
+            f"boot with preempt=full, or {remedy}",
+        )
+    better = "" if mode[1] == "full" else "boot with preempt=full, or "
+    return f"PREEMPT_DYNAMIC, {mode[1]} preemption", better + remedy
 
 
-def fifo(machine: Machine, settings: Realtime) -> Finding:
-    """Check whether SCHED_FIFO is allowed at the requested priority."""
-    wanted = settings.priority
-    if rt_group_runtime_us(machine.read) == 0:
-        text = "this control group has no real-time share"
-        return Finding("SCHED_FIFO", "bad", text, GROUP_REMEDY)
-    if machine.capable(_CAP_SYS_NICE):
-        return Finding("SCHED_FIFO", "ok", f"priority {wanted} allowed (CAP_SYS_NICE)")
-    limit = machine.limit("Max realtime priority")
-    if limit is None or limit >= wanted:
-        shown = "unlimited" if limit is None else f"up to {limit}"
-        return Finding("SCHED_FIFO", "ok", f"priority {wanted} allowed ({shown})")
-    detail = f"rtprio limit {limit}, {wanted} is wanted"
-    return Finding("SCHED_FIFO", "bad", detail, PRIORITY_REMEDY)
-
-
-def locked_memory(machine: Machine) -> Finding:
-    """Check whether all memory may be locked."""
-    limit = machine.limit("Max locked memory")
-    if machine.capable(CAP_IPC_LOCK):
-        return Finding("locked memory", "ok", "any amount (CAP_IPC_LOCK)")
-    if limit is None or limit >= _ENOUGH_LOCKED_BYTES:
-        text = "any amount" if limit is None else f"{limit >> 20} MB"
-        return Finding("locked memory", "ok", text)
-    return Finding("locked memory", "bad", f"limit {limit >> 20} MB", MEMORY_REMEDY)
-
-
-def throttling(machine: Machine) -> Finding:
-    """Check the CPU share of real-time tasks; the loop sleeps, so it needs little."""
-    runtime_us, period_us = machine.number(RT_RUNTIME), machine.number(RT_PERIOD)
-    group_us = rt_group_runtime_us(machine.read)
-    if runtime_us is None:
-        return Finding("RT throttling", "ok", "none in this kernel")
-    text = "off" if runtime_us < 0 else f"{runtime_us} of {period_us} us"
-    if group_us is not None:
-        text += f", this control group {group_us} us"
-    share = min(us for us in (runtime_us, group_us, period_us) if us is not None and us >= 0)
-    if period_us and share < period_us // 2:
-        remedy = f"sysctl kernel.sched_rt_runtime_us={period_us * 95 // 100}, and the group's share"
-        return Finding("RT throttling", "warn", text, remedy)
-    return Finding("RT throttling", "ok", text)
-
-
-def dma_latency(machine: Machine) -> Finding:
-    """Check whether slow idle states can be disabled."""
-    path = machine.path(DMA_LATENCY)
-    if not path.exists():
-        return Finding("idle states", "ok", f"no {DMA_LATENCY}: the kernel manages none")
-    if machine.writable(path):
-        return Finding("idle states", "ok", f"{DMA_LATENCY} can be held at 0")
-    return Finding("idle states", "warn", f"no permission for {DMA_LATENCY}", DMA_REMEDY)
-
-
-def isolated_cpus(machine: Machine, settings: Realtime) -> Finding:
+def isolated_cpus(machine: Machine) -> _Found:
     """Check whether the loop has a CPU of its own."""
-    name = "isolated CPUs"
     isolated = cpu_numbers(machine.text(ISOLATED) or "")
-    ticks = machine.text("/sys/devices/system/cpu/nohz_full") or ""
-    online = cpu_numbers(machine.text("/sys/devices/system/cpu/online") or "")
-    if settings.cpu is not None and online and settings.cpu not in online:
-        remedy = f"realtime.cpu must be one of {', '.join(map(str, online))}"
-        return Finding(name, "bad", f"CPU {settings.cpu} is not online", remedy)
+    online = cpu_numbers(machine.text(f"{_CPU}/online") or "")
     if not isolated:
-        last = online[-1] if len(online) > 1 else None
-        remedy = f"boot with isolcpus={last} nohz_full={last}" if last else ""
-        return Finding(name, "warn", "none: other programs run on the loop's CPU", remedy)
+        last = online[-1] if len(online) > 1 else "N"
+        remedy = f"on several CPUs, boot with isolcpus={last} nohz_full={last}"
+        return "none: other programs run on the loop's CPU", remedy
+    ticks = (machine.text(f"{_CPU}/nohz_full") or "").replace("(null)", "")
     text = ", ".join(map(str, isolated))
-    if set(isolated) <= set(cpu_numbers(ticks if ticks != "(null)" else "")):
-        return Finding(name, "ok", f"{text}, without scheduler ticks")
-    return Finding(name, "ok", f"{text}; nohz_full would spare it the scheduler's ticks")
+    if set(isolated) <= set(cpu_numbers(ticks)):
+        return f"{text}, without scheduler ticks", ""
+    return f"{text}; nohz_full would spare it the scheduler's ticks", ""
 
 
-def governor(machine: Machine) -> Finding:
+def governor(machine: Machine) -> _Found:
     """Check the frequency governor of the CPUs."""
     names = {machine.text(path) for path in machine.glob(f"{_CPU}/cpu*/cpufreq/scaling_governor")}
-    governors = sorted(filter(None, names))
-    if not governors:
-        return Finding("CPU governor", "ok", "none: the kernel does not control the frequency")
-    text = ", ".join(governors)
-    if governors == ["performance"]:
-        return Finding("CPU governor", "ok", text)
-    return Finding("CPU governor", "warn", text, "cpupower frequency-set --governor performance")
+    found = ", ".join(sorted(filter(None, names)))
+    fixed = found in {"", "performance"}
+    text = found or "none: the kernel does not control the frequency"
+    return text, "" if fixed else "cpupower frequency-set --governor performance"
 
 
-def hyperthreads(machine: Machine) -> Finding:
+def hyperthreads(machine: Machine) -> _Found:
     """Check whether two threads share a core and slow each other down."""
-    if machine.text(f"{_CPU}/smt/active") == "1":
-        remedy = (
-            "isolate both threads of a core, or: echo off > /sys/devices/system/cpu/smt/control"
-        )
-        return Finding("SMT", "warn", "on: two threads share a core", remedy)
-    return Finding("SMT", "ok", "off")
+    if machine.text(f"{_CPU}/smt/active") != "1":
+        return "off", ""
+    remedy = "isolate both threads of a core, or: echo off > /sys/devices/system/cpu/smt/control"
+    return "on: two threads share a core", remedy
 
 
-def virtual_machine(machine: Machine) -> Finding:
+def virtual_machine(machine: Machine) -> _Found:
     """Check whether the machine is virtual."""
-    flags = machine.text("/proc/cpuinfo") or ""
     product = machine.text("/sys/class/dmi/id/product_name")
+    if "hypervisor" not in (machine.text("/proc/cpuinfo") or "").split():
+        return product or "not virtual", ""
     kind = machine.text("/sys/hypervisor/type") or product or "a hypervisor"
-    if "hypervisor" in flags.split():
-        remedy = "drive real actuators from a machine of their own"
-        return Finding("hardware", "warn", f"virtual ({kind}): the host can stall it", remedy)
-    return Finding("hardware", "ok", product or "not virtual")
+    return f"virtual ({kind}): the host can stall it", "drive actuators from a dedicated machine"
 
 
-def clock_source(machine: Machine) -> Finding:
+def clock_source(machine: Machine) -> _Found:
     """Check whether reading the time is fast."""
-    folder = "/sys/devices/system/clocksource/clocksource0"
-    source = machine.text(f"{folder}/current_clocksource") or "unknown"
+    source = machine.text(_CLOCK_SOURCE) or "unknown"
     if source in _STEADY_CLOCKS:
-        return Finding("clock source", "ok", source)
-    have = machine.text(f"{folder}/available_clocksource") or ""
-    remedy = "boot with tsc=reliable" if "tsc" in have.split() else ""
-    return Finding("clock source", "warn", f"{source}: slow to read", remedy)
+        return source, ""
+    return f"{source}: slow to read", "boot with tsc=reliable if the machine has a TSC"
 
 
-def latency_timers(machine: Machine) -> Finding:
+def latency_timers(machine: Machine) -> _Found:
     """Check the latency timer of FTDI adapters; by default they hold bytes for up to 16 ms."""
-    slow = []
-    paths = machine.glob(_LATENCY_TIMERS)
-    for path in paths:
-        timer_ms = machine.number(path)
-        if timer_ms is None or timer_ms > _LONG_LATENCY_MS:
-            slow.append(f"{Path(path).parent.name} {timer_ms} ms")
-    if slow:
-        remedy = (
-            'a udev rule: ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", '
-            'ATTR{latency_timer}="1"'
-        )
-        return Finding("FTDI latency", "bad", ", ".join(slow), remedy)
-    return Finding("FTDI latency", "ok", "1 ms" if paths else "no FTDI adapter")
+    timers = {
+        Path(each).parent.name: machine.number(each) for each in machine.glob(_LATENCY_TIMERS)
+    }
+    slow = [f"{name} {timer_ms} ms" for name, timer_ms in timers.items() if timer_ms not in {0, 1}]
+    if not slow:
+        return "1 ms" if timers else "no FTDI adapter", ""
+    rule = 'ACTION=="add", SUBSYSTEM=="usb-serial", DRIVER=="ftdi_sio", ATTR{latency_timer}="1"'
+    return ", ".join(slow), f"a udev rule: {rule}"
 
 
-def serial_ports(machine: Machine) -> Finding:
+def serial_ports(machine: Machine) -> _Found:
     """Check whether this user may open the connected serial ports."""
     ports = [port for pattern in _SERIAL for port in machine.glob(pattern)]
     closed = [port for port in ports if not machine.writable(machine.path(port))]
-    if closed:
-        group = _group_of(machine.path(closed[0]))
-        remedy = f"sudo usermod --append --groups {group} $USER, and log in anew"
-        return Finding("serial ports", "bad", f"no permission for {', '.join(closed)}", remedy)
-    return Finding("serial ports", "ok", ", ".join(ports) or "none plugged in")
+    if not closed:
+        return ", ".join(ports) or "none plugged in", ""
+    try:
+        group = machine.path(closed[0]).group()
+    except (KeyError, OSError):
+        group = "dialout"
+    remedy = f"sudo usermod --append --groups {group} $USER, and log in anew"
+    return f"no permission for {', '.join(closed)}", remedy
 
 
-def serial_daemons(machine: Machine) -> Finding:
+def serial_daemons(machine: Machine) -> _Found:
     """Check for active daemons that open serial ports."""
     running = {machine.text(path) for path in machine.glob("/proc/[0-9]*/comm")}
     active = [name for name in _SERIAL_DAEMONS if name in running]
     if not active:
-        return Finding("serial daemons", "ok", "none active")
-    verb = "read and write" if len(active) > 1 else "reads and writes"
-    text = f"{' and '.join(active)} {verb} serial ports that are plugged in"
+        return "none active", ""
     remedy = f"sudo systemctl disable --now {' '.join(active)}"
-    return Finding("serial daemons", "warn", text, remedy)
+    return f"{', '.join(active)}: use serial ports that are plugged in", remedy
 
 
-def _group_of(path: Path) -> str:
-    import grp
-
-    try:
-        return grp.getgrgid(path.stat().st_gid).gr_name
-    except (KeyError, OSError):
-        return "dialout"
-
-
-def disk_space(machine: Machine, folder: Path) -> Finding:
+def disk_space(machine: Machine, folder: Path) -> _Found:
     """Check the free space for recordings; their folder need not exist yet."""
     try:
         place = folder.absolute()
     except FileNotFoundError:
-        said = f"{folder}: the working folder has been deleted"
-        return Finding("recordings", "bad", said, "change to another one")
+        return f"{folder}: the working folder has been deleted", "change to another one"
     while not place.exists():
         place = place.parent
     free = machine.free_bytes(place)
+    remedy = "make room, or set recording.folder to another disk"
     text = f"{free / 1e9:.1f} GB free for {folder}"
-    if free < _LITTLE_SPACE_BYTES:
-        remedy = "make room, or set recording.folder to another disk"
-        return Finding("recordings", "bad", text, remedy)
-    return Finding("recordings", "ok", text)
+    return text, remedy if free < _LITTLE_SPACE_BYTES else ""
 
 
-def log_out(machine: Machine) -> Finding:
+def log_out(machine: Machine) -> _Found:
     """Check what systemd-logind does to a run when its user logs out."""
-    name = "log-out"
     user = int((machine.status("Uid") or str(os.geteuid())).split()[0])
     if not machine.path("/run/systemd/system").is_dir():
-        return Finding(name, "ok", "no systemd: a log-out removes nothing")
+        return "no systemd: a log-out removes nothing", ""
     settings = _logind_settings(machine)
     if settings.get("KillUserProcesses", "no").lower() not in _NO:
         text = "ends all processes of a user, background runs too (KillUserProcesses=yes)"
-        remedy = "put KillUserProcesses=no into /etc/systemd/logind.conf, or run as a service"
-        return Finding(name, "warn", text, remedy)
+        return text, "put KillUserProcesses=no into /etc/systemd/logind.conf, or run as a service"
     if settings.get("RemoveIPC", "yes").lower() in _NO:
-        return Finding(name, "ok", "removes nothing (RemoveIPC=no)")
+        return "removes nothing (RemoveIPC=no)", ""
     if user <= _SYSTEM_USERS:
-        return Finding(name, "ok", "removes nothing of a system user")
+        return "removes nothing of a system user", ""
     import pwd  # Windows, on which offline commands import this module, has none
 
     try:
@@ -270,9 +174,9 @@ def log_out(machine: Machine) -> Finding:
     except KeyError:
         login = str(user)
     if machine.path(f"/var/lib/systemd/linger/{login}").exists():
-        return Finding(name, "ok", "removes nothing while the user lingers")
+        return "removes nothing while the user lingers", ""
     text = "removes a user's files in /dev/shm, those of active runs too (RemoveIPC=yes)"
-    return Finding(name, "warn", text, f"sudo loginctl enable-linger {login}")
+    return text, f"sudo loginctl enable-linger {login}"
 
 
 def _logind_settings(machine: Machine) -> dict[str, str]:
@@ -343,34 +247,32 @@ def lateness_counts(late_ns: I64) -> dict[int, int]:
     return dict(zip(_EDGES_US[:used].tolist(), counts[:used].tolist(), strict=True))
 
 
-def examine(machine: Machine, settings: Realtime, folder: Path) -> tuple[Finding, ...]:
+def examine(machine: Machine, folder: Path) -> tuple[Finding, ...]:
     """Return the results of all checks; nothing is measured, and no device is opened."""
-    return (
-        preemption(machine),
-        fifo(machine, settings),
-        locked_memory(machine),
-        throttling(machine),
-        dma_latency(machine),
-        isolated_cpus(machine, settings),
-        governor(machine),
-        hyperthreads(machine),
-        virtual_machine(machine),
-        clock_source(machine),
-        latency_timers(machine),
-        serial_ports(machine),
-        serial_daemons(machine),
-        disk_space(machine, folder),
-        log_out(machine),
+    found: dict[str, tuple[Level, _Found]] = {
+        "kernel": ("warn", preemption(machine)),
+        "isolated CPUs": ("warn", isolated_cpus(machine)),
+        "CPU governor": ("warn", governor(machine)),
+        "SMT": ("warn", hyperthreads(machine)),
+        "hardware": ("warn", virtual_machine(machine)),
+        "clock source": ("warn", clock_source(machine)),
+        "FTDI latency": ("bad", latency_timers(machine)),
+        "serial ports": ("bad", serial_ports(machine)),
+        "serial daemons": ("warn", serial_daemons(machine)),
+        "recordings": ("bad", disk_space(machine, folder)),
+        "log-out": ("warn", log_out(machine)),
+    }
+    return tuple(
+        Finding(name, level if remedy else "ok", text, remedy)
+        for name, (level, (text, remedy)) in found.items()
     )
 
 
-def machine_facts(
-    settings: Realtime, folder: Path, machine: Machine = _THIS_MACHINE
-) -> dict[str, str]:
+def machine_facts(folder: Path, machine: Machine = _THIS_MACHINE) -> dict[str, str]:
     """Return the results of all checks as metadata of a recording, such as ``machine.kernel``."""
     return {
         f"machine.{each.name.replace(' ', '_').lower()}": f"{each.level}: {each.text}"
-        for each in examine(machine, settings, folder)
+        for each in examine(machine, folder)
     }
 
 
@@ -387,5 +289,5 @@ def diagnose(
         InputError: The rate is out of range.
         RunError: The measurement failed.
     """
-    found = examine(Machine(), settings, folder)
+    found = examine(Machine(), folder)
     return Diagnosis(found, measure(rate_hz, seconds, settings, on_progress))

@@ -80,7 +80,7 @@ def run_facts(
     return (
         facts
         | _software_facts()
-        | machine_facts(config.realtime, Path(config.recording.folder))
+        | machine_facts(Path(config.recording.folder))
         | _device_facts(info)
     )
 
