@@ -15,6 +15,7 @@ from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.experiment.template import starting_device, starting_experiment
 from hilctl.run.result import Progress, RunResult
 from hilctl.run.start import checked_experiment, output_of, start_run
+from hilctl.run.unpaced import run_unpaced
 
 
 @dataclass(frozen=True, slots=True)
@@ -144,7 +145,5 @@ def run(
     path, texts, chosen = Path(experiment), texts_of(settings), path_or_none(output)
     if not fast:
         return start_run(path, texts, chosen, overwrite, on_progress, take_over=take_over)
-    from hilctl.run.unpaced import run_unpaced  # a supervisor does not need the loop
-
     checked = checked_experiment(path, texts)
     return run_unpaced(checked, output_of(checked, chosen), overwrite=overwrite)

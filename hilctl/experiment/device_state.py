@@ -34,6 +34,7 @@ from hilctl.experiment.state_files import (
 )
 from hilctl.models.base import HysteresisModel
 from hilctl.recording.metadata_keys import HEAT_FACT
+from hilctl.recording.reader import RecordingStream, read
 from hilctl.recording.run_summary import read_ends
 from hilctl.waveforms.build import Reference
 
@@ -126,8 +127,6 @@ def _recorded_commands(path: Path, unit: str, sample_rate_hz: float) -> Iterator
 
     The output is constant in skipped ticks.
     """
-    from hilctl.recording.reader import RecordingStream  # slow to import, rarely needed
-
     samples, held, last, whole, unanswered = 0, 0, 0.0, True, False
     for piece in RecordingStream(path):
         if piece.command_unit != unit:
@@ -285,8 +284,6 @@ def _heat_at_end(path: Path, limits: Limits) -> tuple[float, float]:
         return _finite(end), _unix_s(end["ended"])
     if path.stat().st_size > _LARGEST_BYTES:
         raise DataError(f"{path}: is larger than {_LARGEST_BYTES >> 20} MB")
-    from hilctl.recording.reader import read  # slow to import, rarely needed
-
     recording = read(path)
     rate_hz, samples = recording.sample_rate_hz, recording.samples
     heat = CoilHeat(limits, rate_hz, _finite(run) if HEAT_FACT in run else 0.0)

@@ -15,7 +15,7 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hilctl.base.types import I64
-from hilctl.machine.procfs import Finding, Level, Machine
+from hilctl.machine.procfs import Finding, Level, Machine, login_of
 from hilctl.machine.rt_setup import ISOLATED, Realtime, cpu_numbers
 from hilctl.machine.timer_latency import Latency, measure
 
@@ -167,12 +167,7 @@ def log_out(machine: Machine) -> _Found:
         return "removes nothing (RemoveIPC=no)", ""
     if user <= _SYSTEM_USERS:
         return "removes nothing of a system user", ""
-    import pwd  # Windows, on which offline commands import this module, has none
-
-    try:
-        login = pwd.getpwuid(user).pw_name
-    except KeyError:
-        login = str(user)
+    login = login_of(user) or str(user)
     if machine.path(f"/var/lib/systemd/linger/{login}").exists():
         return "removes nothing while the user lingers", ""
     text = "removes a user's files in /dev/shm, those of active runs too (RemoveIPC=yes)"

@@ -8,11 +8,25 @@ from dataclasses import astuple, dataclass
 from pathlib import Path
 from typing import Literal, Self, TypeAlias
 
+try:
+    import pwd
+    import resource
+except ImportError:  # Windows, on which offline commands import this module
+    pwd = resource = None  # type: ignore[assignment]
+
 CAP_IPC_LOCK = 14
 """Number of the capability to lock memory."""
 _STATM = Path("/proc/self/statm")
 
 Level: TypeAlias = Literal["ok", "warn", "bad"]
+
+
+def login_of(user: int) -> str | None:
+    """Return the name of a user by its number; None if it has none."""
+    try:
+        return pwd.getpwuid(user).pw_name
+    except KeyError:
+        return None
 
 
 @dataclass(frozen=True, slots=True)
@@ -103,8 +117,6 @@ class ProcessUsage:
     @classmethod
     def now(cls) -> Self:
         """Return the usage of this process with all its threads; Linux only."""
-        import resource
-
         pages = int(_STATM.read_text(encoding="ascii").split()[1])
         taken = resource.getrusage(resource.RUSAGE_SELF)
         return cls(

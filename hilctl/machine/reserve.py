@@ -7,6 +7,11 @@ from contextlib import suppress
 from queue import SimpleQueue
 from threading import Event, Semaphore, Thread
 
+try:
+    import resource
+except ImportError:  # Windows, where no runs take place
+    resource = None  # type: ignore[assignment]
+
 _DESCRIPTORS = 8
 """Opening a serial port takes six."""
 
@@ -25,8 +30,6 @@ class Reserve:
         """Take the reserve, unless it was taken; raise OSError or RuntimeError if that fails."""
         if self.thread is not None:
             return
-        import resource  # noqa: F401  so that release() finds it imported; other systems lack it
-
         self._descriptors = [os.open(os.devnull, os.O_RDONLY) for _ in range(_DESCRIPTORS)]
         # A new thread would need memory. A daemon, so that a blocked one does not keep the process.
         thread = Thread(target=self._serve, name="reserve", daemon=True)
@@ -53,8 +56,6 @@ class Reserve:
         """
         if not self._descriptors:
             return False
-        import resource
-
         for kind in (resource.RLIMIT_NOFILE, resource.RLIMIT_AS):
             with suppress(OSError, ValueError):
                 hard = resource.getrlimit(kind)[1]

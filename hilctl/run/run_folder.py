@@ -36,6 +36,7 @@ from hilctl.base.private_dirs import (
     take_lock,
     user_folders,
 )
+from hilctl.machine.procfs import login_of
 
 _log = logging.getLogger(__name__)
 
@@ -468,12 +469,7 @@ def _text_of(holder: tuple[int, int] | None) -> str:
     for run in runs():
         if run.card.supervisor == process:
             return f"run {run.card.experiment} (process {process}, recording {run.card.recording})"
-    import pwd
-
-    try:
-        return f"process {process} of {pwd.getpwuid(user).pw_name}"
-    except KeyError:
-        return f"process {process} of user {user}"
+    return f"process {process} of {login_of(user) or f'user {user}'}"
 
 
 @contextmanager
