@@ -330,19 +330,6 @@ def exchange(ring, count, *, answered=True):
             ring.answered(block)
 
 
-def test_a_later_start_is_written_before_the_first_sample(ring, recording):
-    recording._start_ns = 100
-    recording.record_event(Event(0, "info", "mark", "in the wait"))
-    ring.page.put(PageField.START_NS, 100)
-    recording._drain()
-    assert recording.recorder.events == []
-    ring.page.put(PageField.START_NS, 130)
-    exchange(ring, 2)
-    recording._drain()
-    assert recording.recorder.postponed == [(30, 0)]
-    assert len(recording.recorder.events) == 1
-
-
 def test_a_loop_lost_in_its_first_exchange_leaves_its_later_start(ring, recording):
     recording._start_ns = 100
     ring.page.put(PageField.START_NS, 130)
@@ -351,14 +338,6 @@ def test_a_loop_lost_in_its_first_exchange_leaves_its_later_start(ring, recordin
     recording._finish()
     assert recording.recorder.postponed == [(30, 0)]
     assert recording.recorder.firsts == [0]
-
-
-def test_slots_are_released_after_their_blocks_are_on_disk(ring, recording):
-    exchange(ring, 3)
-    recording._work()
-    assert recording.recorder.firsts == [0, 1, 2]
-    assert ring.page.get(PageField.TAIL) == 2  # an eighth of the ring stays for those who look on
-    assert recording.newest.heads[-1, BlockHeader.FIRST_SAMPLE] == 2
 
 
 def test_fast_loop_does_not_delay_flushes(ring, recording):
@@ -382,27 +361,6 @@ def test_fast_loop_does_not_delay_flushes(ring, recording):
     numbers = recording.recorder.firsts
     assert numbers == list(range(len(numbers)))
     assert ring.pop() is None
-
-
-def test_refused_blocks_stay_in_the_ring(ring, recording, monkeypatch):
-    now_s = 100.0
-    monkeypatch.setattr(recorder.time, "monotonic", lambda: now_s)
-    recording._released_s = now_s
-    recording.recorder.refused = True
-    ring.page.push_event(Event(0, "info", "of_the_loop", ""))
-    exchange(ring, 3)
-    recording._work()
-    now_s = 103.0
-    exchange(ring, 2)
-    recording._work()
-    assert ring.page.get(PageField.TAIL) == ring.page.get(PageField.EVENT_TAIL) == 0
-    assert recording.stalled_s() == 3.0
-    recording.recorder.refused = False
-    recording._work()
-    assert recording.recorder.firsts == [0, 1, 2, 3, 4]
-    assert recording.recorder.events == ["of_the_loop"]
-    assert (ring.page.get(PageField.TAIL), ring.page.get(PageField.EVENT_TAIL)) == (4, 1)
-    assert recording.stalled_s() == 0.0
 
 
 def test_an_event_of_the_loop_never_comes_before_its_samples(ring, recording, monkeypatch):
