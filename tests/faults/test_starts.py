@@ -57,6 +57,30 @@ def test_failed_start_leaves_nothing(device, start, tmp_path, monkeypatch, step)
         pass
 
 
+def test_guardian_that_is_not_ready_is_not_awaited(device, start, tmp_path, monkeypatch):
+    processes = children_of(os.getpid())
+    monkeypatch.setattr(module, "_GUARDIAN_READY_S", 0.0)
+    monkeypatch.setattr(module.SafetyMonitor, "ready", lambda safety: False)
+    with pytest.raises(RunError, match="guardian"):
+        start({**EXPERIMENT, "device": device.section})
+    assert_nothing_is_left(tmp_path, processes)
+
+
+@pytest.mark.parametrize("simulated_device", [True, False])
+def test_refused_real_time_is_reported(device, start, monkeypatch, caplog, simulated_device):
+    """Except for a simulated device, which does not need it."""
+    read_text = module.SharedPage.read_text
+
+    def refused(page, slot):
+        return '[{}, ["fifo: x"]]' if slot is module.PageSlot.SET_UP else read_text(page, slot)
+
+    monkeypatch.setattr(module.SharedPage, "read_text", refused)
+    monkeypatch.setattr(module, "favoured", Mock(side_effect=OSError(24, "stopped by the test")))
+    with pytest.raises(RunError):
+        start(SHORT if simulated_device else {**EXPERIMENT, "device": device.section})
+    assert ("fifo: x" in caplog.text) != simulated_device
+
+
 @pytest.mark.parametrize("number", [signal.SIGINT, signal.SIGTERM])
 def test_signal_before_the_start_is_obeyed(start, tmp_path, monkeypatch, number):
     processes, begin = children_of(os.getpid()), Recorder.begin

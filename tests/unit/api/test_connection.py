@@ -1,5 +1,6 @@
 """Connections to an active run."""
 
+import math
 import subprocess
 import sys
 import time
@@ -9,7 +10,7 @@ import pytest
 
 from hilctl import api
 from hilctl.api import connection
-from hilctl.base.errors import RunError
+from hilctl.base.errors import InputError, RunError
 
 HEAVY = ("numba", "scipy", "matplotlib")
 
@@ -45,3 +46,9 @@ def test_frames_are_those_of_the_run(run, monkeypatch):
     ((feed, every_s, window_s, clock, sleep),) = run.frames(0.2, 2.0)
     assert (feed, every_s, window_s) == ("sine-7", 0.2, 2.0)
     assert (clock, sleep) == (time.monotonic, time.sleep)
+
+
+@pytest.mark.parametrize("times", [{"window_s": 0.0}, {"window_s": math.nan}, {"every_s": -1.0}])
+def test_invalid_times_of_frames_are_refused(run, times):
+    with pytest.raises(InputError, match=next(iter(times))):
+        run.frames(**times)

@@ -164,3 +164,14 @@ def learn(monkeypatch, tmp_path, hilctl):
 def test_exit_code_of_learn(learn, tmp_path, how, code):
     assert learn(**how)[0] == code
     assert (tmp_path / "correction.yaml").is_file()
+
+
+def test_learn_refuses_existing_files(learn, tmp_path):
+    (tmp_path / "correction-runs").mkdir()
+    (tmp_path / "correction-runs" / "run-00.mcap").touch()
+    code, _, err = learn()
+    assert (code, "--folder" in err) == (2, True)
+    (tmp_path / "correction.yaml").write_text("mine")
+    code, _, err = learn()
+    assert (code, "--overwrite" in err) == (2, True)
+    assert (tmp_path / "correction.yaml").read_text() == "mine"

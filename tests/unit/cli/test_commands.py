@@ -10,6 +10,7 @@ from types import SimpleNamespace
 import pytest
 import typer
 
+from hilctl import __version__
 from hilctl.base.errors import InputError
 from hilctl.cli.commands import COMMANDS, app, load
 
@@ -139,3 +140,20 @@ main()
 """
     ended = in_a_process(code, "--help")
     assert ended.returncode == 0, ended.stderr
+
+
+@pytest.mark.parametrize("name", ["check", "report"])
+def test_eof_error_is_not_reported_as_ctrl_d(hilctl, monkeypatch, name):
+    def ended():
+        raise EOFError("ran out")
+
+    monkeypatch.setattr("hilctl.cli.reports.report", ended)
+    monkeypatch.setattr("hilctl.cli.run.check", ended)
+    code, _, stderr = hilctl(name)
+    assert code == 3
+    assert stderr.startswith("hilctl: ")
+    assert "ran out" in stderr
+
+
+def test_version(hilctl):
+    assert hilctl("--version")[1] == f"hilctl {__version__}\n"

@@ -91,3 +91,10 @@ def test_stop_prints_one_line_per_run(capsys, tmp_path, monkeypatch):
     assert [line.partition(" ")[0] for line in lines] == ["a", "b", "c", "d", "no"]
     assert lines[3] == "d stopped; no recording"
     assert lines[2].endswith("no right")
+
+
+def test_status_and_stop_without_runs(hilctl, json_of):
+    assert json_of("status") == (0, {"runs": []})
+    assert hilctl("status")[:2] == (0, "no active run\n")
+    assert hilctl("stop", "--all")[0] == 0
+    assert hilctl("stop", "--all", "--run", "a")[0] == 2

@@ -16,6 +16,7 @@ from hilctl.base.events import Event
 from hilctl.cli import live as module
 from hilctl.cli.console import print_rich
 from hilctl.cli.live import View, print_lines
+from hilctl.run.run_folder import run_folder
 
 
 class FakeFeed:
@@ -264,3 +265,39 @@ def run(monkeypatch):
     }.items():
         monkeypatch.setattr(f"hilctl.cli.live.{name}", value)
     return made
+
+
+@pytest.fixture
+def served(monkeypatch):
+    """Replace the servers; return their arguments."""
+    given = {}
+
+    def serve(chosen, over, on_url, port, *, foxglove):
+        given.update(chosen=chosen, over=over, port=port)
+        on_url("ws://127.0.0.1:5" if foxglove else "http://127.0.0.1:5/#x")
+
+    monkeypatch.setattr(module, "serve_runs", serve)
+    return given
+
+
+@pytest.mark.parametrize(("words", "port", "shown"), [
+    (["--port", "0"], 0, "live page: http://127.0.0.1:5/#x"),
+    (["--port", "5"], 5, "live page: http://127.0.0.1:5/#x"),
+    (["--foxglove"], None, "Foxglove server: ws://127.0.0.1:5"),
+    (["--foxglove", "--port", "0"], 0, "Foxglove server: ws://127.0.0.1:5"),
+])  # fmt: skip
+def test_server_is_started_and_its_address_printed(served, hilctl, words, port, shown):
+    assert hilctl("live", *words)[1] == f"{shown}\n"
+    assert served["port"] == port
+    assert (served["chosen"]([]), served["chosen"](["a", "b"])) == (None, "a")
+    assert not served["over"](None)
+
+
+def test_server_of_a_run_ends_with_it(served, hilctl, tmp_path):
+    nothing = SimpleNamespace(feed=lambda name: None)
+    with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
+        assert hilctl("live", "x")[0] == 2
+        assert hilctl("live", "de")[0] == 0
+        assert served["chosen"]([]) == folder
+        assert not served["over"](nothing)
+    assert served["over"](nothing)

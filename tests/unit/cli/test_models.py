@@ -5,7 +5,8 @@ from pathlib import Path
 
 import pytest
 
-from hilctl.cli.models import headings, notes, render_comparison, table_rows
+from hilctl.base.errors import InputError
+from hilctl.cli.models import _numbers, headings, notes, render_comparison, table_rows
 from hilctl.experiment.examples import examples_folder
 from hilctl.lab.comparison.compare import compare
 from hilctl.lab.identify.data.data_files import LoadedRecords
@@ -86,3 +87,10 @@ def test_a_model_is_exported(hilctl, json_of, tmp_path):
     assert json_of("export-model", model, output, "--rate-hz", 1e3) == (0, {"output": str(output)})
     assert "void piezo(" in output.read_text(encoding="utf-8")
     assert hilctl("export-model", model, output, "--rate-hz", 1e3)[0] == 2
+
+
+def test_frequencies_are_numbers():
+    assert _numbers(None) is None
+    assert _numbers("1, 2.5,1e2") == [1.0, 2.5, 100.0]
+    with pytest.raises(InputError, match="--frequencies"):
+        _numbers("ten")

@@ -210,3 +210,12 @@ def test_worst_minutes_are_shown(lagging, minutes, shown):
     cells = [line.split("│") for line in table if line.startswith("│")]
     assert [int(row[1]) for row in cells] == list(shown)
     assert {row[2].strip() for row in cells} == {"60,000"}
+
+
+def test_segments_have_a_table_without_empty_columns(make_recording):
+    parts = [segment(0, 3000, 1000.0, "first"), segment(3000, 3000, 1000.0, "second")]
+    recording = make_recording(wave(1000.0, 6, LAG), command=wave(1000.0, 6), segments=parts)
+    text = terminal(summarize(recording))
+    for shown in ("first", "second", "peak hyst. %"):
+        assert shown in text
+    assert "err. %" not in text

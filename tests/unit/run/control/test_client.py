@@ -1,6 +1,7 @@
 """Runs from outside: selection of a run, requests to it, and the signal that stops it."""
 
 import os
+import signal
 import socket
 import subprocess
 import sys
@@ -219,6 +220,14 @@ def test_a_supervisor_that_is_gone_is_no_error(process):
     process.kill()
     process.wait()
     assert not request_stop(run_of(process.pid))
+
+
+def test_refused_signal_is_an_error(process, monkeypatch):
+    monkeypatch.setattr(
+        signal, "pidfd_send_signal", Mock(side_effect=PermissionError(1, "Operation not permitted"))
+    )
+    with pytest.raises(RunError, match="not permitted"):
+        request_stop(run_of(process.pid))
 
 
 @pytest.fixture
