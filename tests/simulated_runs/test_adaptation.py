@@ -1,4 +1,4 @@
-"""Adaptation on the simulated rig: what it takes out, and that such a run replays bit for bit."""
+"""Adaptation on the simulated rig: compensated changes, and replay bit for bit."""
 
 from pathlib import Path
 

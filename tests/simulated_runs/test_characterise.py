@@ -1,4 +1,4 @@
-"""Characterising simulated rigs: from limits to a model that compensates, killed and taken up."""
+"""Characterisation of simulated rigs: from limits to a model, also after a kill."""
 
 import os
 import re
@@ -52,7 +52,7 @@ def test_a_rig_of_any_physics_gets_a_model(tmp_path, other_rigs, physics, within
 
 @pytest.mark.long
 def test_a_piezo_that_begins_at_0_v_gets_a_model(tmp_path):
-    """It may go no further than its sensor shows, 38 um."""
+    """Its range is that of its sensor, 38 um."""
     found = characterised(
         CONFIGS / "piezo_sine.yaml", [], tmp_path / "runs", tmp_path / "model.yaml"
     )

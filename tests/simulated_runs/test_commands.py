@@ -1,4 +1,4 @@
-"""Commands one after the other, as a user types them, and what comes of each."""
+"""A series of commands, as a user types them, and their results."""
 
 import json
 from pathlib import Path
@@ -19,13 +19,13 @@ def hilctl(*arguments, code=0):
 
 @pytest.fixture(scope="module")
 def folder(tmp_path_factory):
-    """Where this module's recordings go."""
+    """Folder of this module's recordings."""
     return tmp_path_factory.mktemp("rig")
 
 
 @pytest.fixture(scope="module")
 def run(folder):
-    """A compensated run at full stroke, 100 Hz, and what it printed."""
+    """A compensated run at full stroke, 100 Hz, and its printed result."""
     path = folder / "run.mcap"
     settings = ("--set", "waveform.frequency_hz=100", "--set", "waveform.duration_s=1.0")
     printed = hilctl(
@@ -74,7 +74,7 @@ def test_replay_is_identical(run):
 
 
 def test_replay_with_another_model(run):
-    """With another model it says what that would have done, and is not a failure."""
+    """Another model is evaluated, which is no failure."""
     path, _ = run
     other = CONFIGS / "models" / "terfenol_omega_chapter4.yaml"
     result = json.loads(hilctl("replay", path, "--model", other, "--json"))
@@ -96,7 +96,7 @@ def test_export_agrees_with_an_independent_reader(run, folder):
 
 
 def test_check_moves_nothing(folder):
-    """Check says what a run would do."""
+    """Check prints the forecast of a run."""
     forecast = json.loads(hilctl("check", CONFIGS / "demo.yaml", "--json"))
     assert forecast["samples"] == 500_000
     assert forecast["command_unit"] == "A"

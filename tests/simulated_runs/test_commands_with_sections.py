@@ -1,4 +1,4 @@
-"""Every command that moves a rig with every section of an experiment: it works, or names the key.
+"""Every command that moves a rig with every section of an experiment: success, or the key.
 
 The table is complete in the sections. Each cell states how the command ends.
 """

@@ -35,7 +35,7 @@ def test_nothing_is_lost_at_50_khz(sweep):
 
 
 def test_loop_has_little_memory_and_no_page_faults(sweep):
-    """All that a tick needs is in RAM before the first, the ring's 27 MB included."""
+    """All memory of a tick is in RAM before the first one, including the ring of 27 MB."""
     loop = sweep.processes["loop"]
     assert loop.resident_bytes < 300e6
     assert loop.major_faults == 0

@@ -1,4 +1,4 @@
-"""The scripts of ``examples/`` run as they are, and what they print and write is what they say."""
+"""The scripts of ``examples/`` run unchanged, with the documented output and files."""
 
 import os
 import re

@@ -1,4 +1,4 @@
-"""The inverse out and in again in mid-run, at full stroke and 100 Hz, on the simulated rig."""
+"""The inverse bypassed and enabled during a run, at full stroke and 100 Hz, on a simulated rig."""
 
 from dataclasses import replace
 from pathlib import Path
@@ -21,7 +21,7 @@ OUT_S, IN_S, FADE_S = 1.0, 2.0, 0.25
 
 
 class _Switched(unpaced.OfflineHost):
-    """Takes the inverse out and in where a run stands at these times."""
+    """Bypasses and enables the inverse at given times of a run."""
 
     changes: tuple[Tuning, ...] = ()
 
@@ -81,7 +81,7 @@ def test_no_step_is_beyond_the_slew_and_it_replays_bit_for_bit(switched):
 
 
 def test_bypass_replays_in_pieces(switched, monkeypatch):
-    """A fade may begin in one piece and end in another, and its event stand behind its samples."""
+    """A fade may begin in one piece and end in another, and its event may follow its samples."""
     recording, _ = switched
     monkeypatch.setattr(reader, "PIECE_SAMPLES", 3000)
     assert len(list(RecordingStream(recording.path))) > 20

@@ -72,7 +72,7 @@ def test_unmodelled_load_is_learned(tmp_path, load_kg, frequency_hz):
 
 
 class Late:
-    """A rig behind a link that hands displacements over some samples late."""
+    """A rig with a link that delays displacements by some samples."""
 
     def __init__(self, device, samples):
         self._device = device
@@ -106,7 +106,7 @@ def test_the_delay_of_a_link_is_found(tmp_path):
 
 
 def test_excessive_bandwidth_is_reduced(tmp_path):
-    """A correction that would break a limit is not run; smaller steps are."""
+    """A correction beyond a limit is not run; smaller steps are."""
     learned = learn(tmp_path, at(250.0, "limits.slew_a_per_s=14700.0"), cycles=8)
     assert "corrections were refused" in learned.reason
     assert "14700 A/s" in learned.reason

@@ -1,4 +1,4 @@
-"""A run with its live page, in real processes: looked at, stopped by it, and its server killed."""
+"""A run with its live page in real processes: view, stop, and a killed server."""
 
 import asyncio
 import json

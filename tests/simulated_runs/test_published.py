@@ -1,4 +1,4 @@
-"""Published compensation of chapters 3, 5 and 6, by whole runs that wait for no real time.
+"""Published compensation of chapters 3, 5 and 6, in complete runs without real time.
 
 The rig is fitted to the figures of the dissertation, not to its data: where the published
 parameters do not give the published figure on it, the test says which they do give.

@@ -16,7 +16,7 @@ OMEGA = CONFIGS / "models" / "terfenol_omega.yaml"  # identified on full strokes
 
 
 def run(path, model, frequency_hz, amplitude_um, seed, strain=1.05):
-    """Run a rig that moves 5 % further than the one that the model is of; return its recording."""
+    """Run a rig that moves 5 % further than the one of the model; return its recording."""
     settings = [
         f"compensator.model={model}", f"waveform.frequency_hz={frequency_hz}",
         f"waveform.amplitude={amplitude_um}", f"device.seed={seed}", f"device.vary.strain={strain}",

@@ -1,4 +1,4 @@
-"""Every kind of fit gives the same model, whatever arithmetic the processor has.
+"""Every kind of fit gives the same model on every processor.
 
 OpenBLAS picks its kernels by processor, and sums in another order on each. What a fit makes of that
 must stay rounding. Each set of kernels runs in a process of its own.
@@ -40,7 +40,7 @@ CLOSE = 1e-6  # relative to the largest of the values that belong together
 
 
 def history() -> History:
-    """Return what the rig does with a random command from rest, small parts after large ones."""
+    """Return the response to a random command from rest, small parts after large ones."""
     rng = np.random.default_rng(4)
     time = np.arange(round(0.5 * RATE_HZ)) / RATE_HZ
     sines = [np.sin(2 * np.pi * f * time + rng.uniform(0, 6)) for f in rng.uniform(4.0, 200.0, 12)]
@@ -50,7 +50,7 @@ def history() -> History:
 
 
 def kernels_in_use() -> set[str]:
-    """Return the kernels that NumPy's and SciPy's OpenBLAS have taken, as they say themselves."""
+    """Return the kernels that NumPy's and SciPy's OpenBLAS report."""
     names = set()
     for package in (np, scipy):
         folder = Path(package.__file__).parents[1] / f"{package.__name__}.libs"
@@ -76,7 +76,7 @@ def fit_all() -> None:
 
 
 def numbers(value: object, name: str = "") -> dict[str, F64]:
-    """Return all numbers of a model, those that belong together in one array."""
+    """Return all numbers of a model in arrays."""
     if isinstance(value, dict):
         parts = [numbers(inner, f"{name}.{key}") for key, inner in value.items()]
         return {key: array for part in parts for key, array in part.items()}

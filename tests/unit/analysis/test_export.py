@@ -1,4 +1,4 @@
-"""Exports, read back bit for bit by readers that are not ours."""
+"""Exports, read back bit for bit by independent readers."""
 
 import csv
 import errno
@@ -55,7 +55,7 @@ def recording(unit: str = "A", *, measured: bool = True, n: int = 2000) -> Recor
 
 
 def expected(run: Recording) -> dict[str, np.ndarray]:
-    """Return every column under the name it must have, in the order it must have."""
+    """Return every column with its expected name, in the expected order."""
     wanted, command, measured = NAMES[run.command_unit]
     samples = run.samples
     table = {
@@ -217,7 +217,7 @@ def folder(tmp_path):
 
 
 def exported(folder, output):
-    """Export, and return how many were written, there, and left out for which reasons."""
+    """Export; return the numbers of written and existing files, and the reasons of omitted ones."""
     parts = []
     done = export_all(folder, output, lambda part, path: parts.append(part))
     assert parts == sorted(parts)

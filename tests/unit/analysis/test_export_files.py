@@ -1,4 +1,4 @@
-"""Files of columns that come in pieces: the same as of all at once."""
+"""Files of columns in pieces are the same as of the whole."""
 
 import errno
 import gc
@@ -100,7 +100,7 @@ def test_abandoned_parquet_file_does_not_write(capfd):
 
 
 def test_only_columns_with_nulls_are_nullable(tmp_path):
-    """Arrow's, which readers of a folder of files want alike, and those of any Python object."""
+    """Nullability is the same in all files of a folder."""
     given = {**WHOLE, "b": pa.array([None] * 30_001, pa.float64()), "c": ["x", None, "y"] * 10_000}
     given["c"] += ["z"]
     given["d"] = np.array(given["c"], dtype=object)

@@ -1,4 +1,4 @@
-"""Replay: commands recomputed from a recording, bit for bit, and what can not be."""
+"""Replay: commands recomputed from a recording bit for bit, and refusals."""
 
 from dataclasses import replace
 from itertools import pairwise
@@ -100,7 +100,7 @@ def test_impossible_states_are_refused(recording):
 
 
 def test_no_sample_is_replayed_twice():
-    """A start without a gap before it ends the stretch before it: work stays in proportion."""
+    """A start without a gap ends the range before it, so that the work stays proportional."""
     recording = read(GOLDEN / "terfenol_uncompensated.mcap")
     start = recording.starts[0]
     starts = tuple(
@@ -141,7 +141,7 @@ def test_another_model_looks_ahead_into_the_next_piece(recording, bounds):
 
 @pytest.mark.parametrize("cut", range(0, 300, 50))
 def test_gaps_at_the_ends_of_pieces(recording, cut):
-    """Behind a gap only a start says what the memory is, whether a piece ends there or not."""
+    """After a gap only a start gives the memory, even at the end of a piece."""
     index = recording.samples.index
     kept = recording.samples.rows((index < 1000) | (index >= 1200))
     damaged = replace(recording, samples=kept)
@@ -181,7 +181,7 @@ def test_exact_model_predicts_no_error(recording):
 
 
 def test_model_of_the_run_predicts_the_recorded_error(recording):
-    """But for what its inverse, where the rate is in it, is not exact by: about a tenth here."""
+    """Except for the error of a rate-dependent inverse, about a tenth here."""
     model = parse_model("model.yaml", recording.model_yaml)
     found = predicted(model, recording.sample_rate_hz, recording.samples)
     assert found.rms_percent == pytest.approx(found.recorded_rms_percent, rel=0.2)

@@ -58,7 +58,7 @@ def lagging(make_recording):
 
 
 def check_loop(report: RunReport) -> None:
-    """Hold a lagging sine's figures against their closed forms."""
+    """Compare the metrics of a lagging sine with their closed forms."""
     assert report.peak_hysteresis_percent == pytest.approx(100.0 * np.sin(LAG), rel=1e-3)
     area = np.pi * (0.5 * STROKE_UM) ** 2 * np.sin(LAG)
     assert report.loop_area == pytest.approx(area, rel=1e-3)
@@ -169,7 +169,7 @@ class TestSteadyPeriodicRun:
         assert dict(run_rows(report))["sensor zero"].startswith("1.250 µm")
 
     def test_short_period_has_no_noise_estimate(self, lagging) -> None:
-        """With 12 samples a period, signal can't be told from noise."""
+        """With 12 samples per period, signal and noise cannot be separated."""
         report = summarize(lagging(period=12.0, cycles=100))
         assert report.sensor_noise_um is None
         assert report.noise_floor_percent is None
@@ -289,7 +289,7 @@ class TestWholeRun:
         assert second.start_s == pytest.approx(4000 / RATE_HZ)
 
     def test_noise_floor_is_that_of_the_worst_segment(self, make_recording) -> None:
-        """A noisier segment with less hysteresis does not lend its floor; noise is pooled."""
+        """It is not that of a noisier segment with less hysteresis; noise is pooled."""
         rng = np.random.default_rng(8)
         reference_um = np.concatenate((wave(1000.0, 9), 0.1 * wave(1000.0, 3)))
         displacement_um = np.concatenate((wave(1000.0, 9, 0.2), 0.1 * wave(1000.0, 3, 0.01)))
@@ -387,7 +387,7 @@ def test_a_report_in_pieces_is_that_of_the_whole(monkeypatch, path, size, stretc
 
 
 class Counted:
-    """Pieces of a recording in memory, and how often they were gone through."""
+    """Pieces of a recording in memory, with the number of passes."""
 
     def __init__(self, recording: Recording, rows: int) -> None:
         self.walks = 0
@@ -453,6 +453,6 @@ def test_damaged_usage_is_refused_with_its_place(text):
 
 
 def test_whole_float_is_a_whole_number():
-    """Other programs may write it so."""
+    """Other programs may write it like this."""
     text = usage_facts(LOOP, SUPERVISOR)[USAGE_FACT].replace("98000000", "98000000.0")
     assert processes_of(with_end({USAGE_FACT: text}))["loop"] == LOOP

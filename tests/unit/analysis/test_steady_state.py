@@ -1,4 +1,4 @@
-"""Which part of a run is judged whose reference was moved while it went on."""
+"""Evaluated part of a run whose reference was tuned."""
 
 from dataclasses import replace
 

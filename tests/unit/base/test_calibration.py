@@ -1,4 +1,4 @@
-"""Calibration files: what they must hold, and the curve of a sensor."""
+"""Calibration files: their rules, and the curve of a sensor."""
 
 import numpy as np
 import pytest

@@ -1,4 +1,4 @@
-"""What errors say, and who is caught by whom."""
+"""Texts and classes of errors."""
 
 import pickle
 import re
@@ -43,7 +43,7 @@ def subclasses(kind):
 
 
 def test_every_error_passes_from_process_to_process():
-    """Its class, its text and all that it holds are those that were raised."""
+    """Class, text and attributes are unchanged."""
     root = Path(__file__).parents[3]
     for package in (root, root / "drivers"):
         for path in package.glob("hilctl*/**/*.py"):

@@ -1,4 +1,4 @@
-"""Text files are read once, and not at all once the texts are given; files are written whole."""
+"""Text files are read once, or not at all if the texts are given; files are written completely."""
 
 import errno
 import os

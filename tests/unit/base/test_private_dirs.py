@@ -1,4 +1,4 @@
-"""Whose a folder is, before anything is put into it."""
+"""Private folders: owner and permissions."""
 
 import os
 

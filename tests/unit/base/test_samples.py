@@ -10,7 +10,7 @@ BLOCK = 5
 
 
 def batch(blocks: int) -> BlockBatch:
-    """Return blocks of random numbers that follow one another."""
+    """Return consecutive blocks of random numbers."""
     made = BlockBatch.empty(blocks, BLOCK, 1, aux=2)
     made.aux[:] = np.arange(2 * blocks).reshape(blocks, 2)
     rng = np.random.default_rng(1)

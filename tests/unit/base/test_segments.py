@@ -1,4 +1,4 @@
-"""Which samples of a run are judged."""
+"""Evaluated samples of a segment."""
 
 import json
 

@@ -1,4 +1,4 @@
-"""The one base of all pydantic models: nothing is guessed, ignored or changed."""
+"""The base of all pydantic models: no coercion, no unknown keys, no changes."""
 
 import pytest
 from pydantic import ValidationError

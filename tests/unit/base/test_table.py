@@ -10,7 +10,7 @@ from hilctl.base.table import RowError, Table, TableRows, TextTable, open_table
 
 
 class Names(Table):
-    """Columns without rows; two may have the same name."""
+    """Columns without rows; names may occur twice."""
 
     def read(self, columns, first_row=1, last_row=None, gaps=None) -> TableRows:
         raise NotImplementedError
@@ -27,7 +27,7 @@ def time_rows(times) -> TableRows:
 
 
 def test_columns(tmp_path: Path) -> None:
-    """By name or by number; what is not there, or twice, is refused with what is."""
+    """By name or number; missing and ambiguous names are refused with the known ones."""
     names = ["t", "x", "x", "4"]
     table = Names(tmp_path / "t.csv", names)
     assert [table.index(column) for column in ("t", 1, "4", 4, 2)] == [0, 0, 3, 3, 1]
@@ -157,7 +157,7 @@ def test_numbers_keep_their_bits(table) -> None:
     ("a;b,c\n1;2\n", ["a", "b,c"]),
 ])  # fmt: skip
 def test_names(table, text: str, names: list[str]) -> None:
-    """Names stand in the first row, or in a comment above it of as many cells."""
+    """Names are in the first row, or in a comment above it with as many cells."""
     assert table(text).names == names
 
 
@@ -197,7 +197,7 @@ def test_columns_that_are_not_read_may_contain_text(table) -> None:
     (5, None, "5 to the last"), (0, 2, "0 to 2"), (3, 2, "3 to 2"), (1, 5, "1 to 5"),
 ])  # fmt: skip
 def test_rows(table, other: str, first: int, last: int | None, found: list[int] | str) -> None:
-    """Rows count from 1; those that are not there are refused, whichever way it is read."""
+    """Rows count from 1; missing ones are refused."""
     made = table("".join(f"{k},{other}\n" for k in range(4)))
     if isinstance(found, str):
         text = f"t.csv: has 4 rows: rows {found} are not all there"

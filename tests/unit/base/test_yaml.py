@@ -1,4 +1,4 @@
-"""Documents: values with their places, settings from the command line, problems in words."""
+"""Documents: values with their places, settings from the command line, problems."""
 
 from collections.abc import Mapping
 from typing import Annotated, ClassVar, Literal

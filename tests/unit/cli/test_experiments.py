@@ -105,7 +105,7 @@ def test_init_refuses_wrong_input_and_existing_files(here, hilctl, words, messag
 
 
 class Terminal(io.StringIO):
-    """Scripted answers; a question too many aborts."""
+    """Scripted answers; an extra question aborts."""
 
     def isatty(self):
         return True

@@ -1,4 +1,4 @@
-"""Adaptation in the loop's terms: what it finds, what stops it, and what it says."""
+"""Adaptation: identified parameters, conditions that stop it, and its events."""
 
 import math
 
@@ -28,7 +28,7 @@ def adaptation(due_after=0, shown_after=0, noise_um=0.0, bounds=BOUNDS, referenc
 
 
 class Actuator:
-    """What is beside the model, with given parameters and a delay."""
+    """The operator that the model lacks, with given parameters and a delay."""
 
     def __init__(self, operator, true, delay):
         self.operator, self.form, self.memory = operator, operator.form(true), None
@@ -49,7 +49,7 @@ class Actuator:
 
 
 def follow(adapting, actuator, block, noise=None, reference=REFERENCE):
-    """Run the reference; return what each displacement is away from what is due."""
+    """Run the reference; return the error of each displacement."""
     errors, due = [], np.concatenate((np.full(actuator.late.size, reference[0]), reference))
     for start in range(0, reference.size - block + 1, block):
         made = made_block(block)
@@ -153,7 +153,7 @@ def test_constant_reference_identifies_the_offset_only():
 
 
 def test_events():
-    """Once a second where something has moved, and at the end; a bound is said."""
+    """Once a second if a parameter has moved, and at the end; a reached bound is named."""
     adapting, operator = adaptation(bounds=AdaptationBounds(1.0, 0.1, 0.0))
     assert adapting.event(5000) is None
     follow(adapting, Actuator(operator, np.array([3.0, 0, 0, 0, 0]), 0), 50)

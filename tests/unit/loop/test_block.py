@@ -1,4 +1,4 @@
-"""A block is views of one slot: what is written in it stands in the slot's own arrays."""
+"""A block is views of one slot: values written to it are in the arrays of the slot."""
 
 from hilctl.base.samples import COLUMNS, BlockBatch
 from hilctl.loop.block import Block

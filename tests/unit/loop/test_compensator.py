@@ -1,4 +1,4 @@
-"""The compensator: what it has to be fed, its memory, and what it refuses."""
+"""The compensator: its input, memory and refusals."""
 
 from dataclasses import replace
 

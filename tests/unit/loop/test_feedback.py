@@ -1,4 +1,4 @@
-"""Feedback around the compensator: gains, margins, windup, and what it does to bad readings."""
+"""Feedback around the compensator: gains, margins, windup and invalid readings."""
 
 import math
 
@@ -228,9 +228,9 @@ class TestAroundModels:
         return errors
 
     def test_a_right_model_is_left_alone(self, model):
-        """References meet the displacements that they belong to: what is corrected is next to nil.
+        """References are compared with their own displacements: almost nothing is corrected.
 
-        Central differences are not the structure to the bit.
+        Central differences do not invert the structure exactly.
         """
         without = np.abs(self.errors(model, 0.0, limit_um=1e-12)).max()
         assert np.abs(self.errors(model, 0.0)).max() <= 1.05 * without + 1e-9

@@ -1,4 +1,4 @@
-"""What ends a run: each interlock by itself, at its very edge, and what it says."""
+"""Interlocks: each one at its limit, with its message."""
 
 import math
 from dataclasses import replace
@@ -18,7 +18,7 @@ STROKE = RigInterlocks(stroke_um=(-60.0, 50.0), sensor_um=(-100.0, 100.0))
 
 
 class Fed:
-    """Interlocks that are fed columns, each a number, a list, or NaN where it is left out."""
+    """Interlocks with columns as input, each a number, a list, or NaN if omitted."""
 
     def __init__(self, limits, rate_hz=RATE_HZ):
         self.interlocks = limits.made(rate_hz)
@@ -38,7 +38,7 @@ class Fed:
 
 
 def trips(limits, n, **columns):
-    """Return the trip, and where the flags of all interlocks stand, of one block."""
+    """Return the trip of one block, and the flags."""
     bench = Fed(limits)
     trip = bench.feed(n, **columns)
     return trip, bench
@@ -208,7 +208,7 @@ class TestThermal:
         assert trips(THERMAL, 5, command=2.9)[0] is None
 
     def test_starts_at_the_heat_of_the_output_that_is_found(self):
-        """What stood at 3 A before the run has used up a budget of 2 A, and no less than safe."""
+        """An initial output of 3 A has used up a budget of 2 A."""
         assert trips(THERMAL, 5)[0] is None
         bench = Fed(THERMAL)
         bench.interlocks.begin_at(3.0)

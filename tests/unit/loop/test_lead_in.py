@@ -1,4 +1,4 @@
-"""What comes before a waveform: where each part begins, and what is taken out after it."""
+"""The lead-in before a waveform: its parts, and the removed offset."""
 
 import math
 

@@ -1,4 +1,4 @@
-"""The loop, with a device and a clock that the test makes."""
+"""The loop, with a fake device and clock."""
 
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -556,7 +556,7 @@ def test_last_block_may_be_shorter():
 
 @dataclass
 class AgingFakeDevice(FakeDevice):
-    """A device with a sensor that sends unasked: each reading is as old as its sample's number."""
+    """A device with a streaming sensor: each reading is as old as its sample's number."""
 
     info: FakeInfo = field(
         default_factory=lambda: FakeInfo(ages_readings=True, corrects_readings=True)

@@ -1,4 +1,4 @@
-"""Pacing on absolute deadlines, with a clock that the test turns."""
+"""Pacing on absolute deadlines, with a fake clock."""
 
 import errno
 
@@ -194,7 +194,7 @@ def test_sleep_that_a_signal_interrupts_goes_on(monkeypatch):
 
 class TestTooLate:
     def paced(self, stalls_ns, ticks, **rules):
-        """Return a pacer after so many ticks; every sleep but those named ends in time."""
+        """Return a pacer after a number of ticks, with the named stalls."""
         rules = LateRules(late_after_ns=0.5 * PERIOD_NS, **rules)
         made = Pacer(FakeClock(0, stalls_ns), PERIOD_NS, "catch_up", rules)
         made.begin(0)

@@ -1,4 +1,4 @@
-"""An output on its way to the safe value: by a ramp, until the device confirms that it holds."""
+"""The ramp of an output to the safe value, until the device confirms it."""
 
 import errno
 from types import SimpleNamespace

@@ -52,7 +52,7 @@ def test_cycles_do_not_drift():
 
 @dataclass
 class DigitalDouble(FakeDevice):
-    """A device that notes its pulses by the number of commands before, and reads given levels."""
+    """A device that records its pulses by the number of commands before, and reads given levels."""
 
     high_from: int = 0  # reading
     reads: int = 0

@@ -22,7 +22,7 @@ def tuned(tuner, values, out):
 
 
 def run(tuner, reference, block, moves):
-    """Put a reference through in blocks; ``moves`` begin at sample indices."""
+    """Tune a reference in blocks; ``moves`` begin at sample indices."""
     out = np.empty_like(reference)
     for start in range(0, reference.size, block):
         if start in moves:
@@ -84,7 +84,7 @@ BACK = replace(FADE, samples=20, inverse_share=1.0)
 
 
 def faded(tuner, reference, wanted, block, moves):
-    """Put commands through in blocks; return them, and where a flag is set."""
+    """Fade commands in blocks; return them, and the flagged samples."""
     out, flags = wanted.copy(), np.zeros(wanted.size, dtype=np.uint32)
     for start in range(0, wanted.size, block):
         if start in moves:

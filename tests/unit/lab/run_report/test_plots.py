@@ -213,7 +213,7 @@ SHORT_PERIOD = 500
 
 
 def test_many_loops_are_not_all_named(make_recording):
-    """A legend longer than the figure says nothing: the first, the last and the worst do."""
+    """A long legend has only the first, the last and the worst."""
     wave_um = 10.0 * np.sin(2.0 * np.pi * np.arange(40 * SHORT_PERIOD) / SHORT_PERIOD)
 
     def named(count):

@@ -53,7 +53,7 @@ class Page(HTMLParser):
 
 @pytest.fixture(scope="module")
 def recording(make_recording) -> Recording:
-    """Return a run of two segments whose every text wants to be markup."""
+    """Return a run of two segments with markup in every text."""
     phase = 2.0 * np.pi * np.arange(8000) / 1000
     lag = np.where(np.arange(8000) < 4000, 0.02, 0.1)
     recording = make_recording(
@@ -170,7 +170,7 @@ def test_only_the_last_events_are_listed(recording: Recording) -> None:
 
 @pytest.mark.usefixtures("undrawn")
 def test_largest_numbers_have_no_figure(recording: Recording) -> None:
-    """No axis can show them; the figures in words stay."""
+    """No axis can show them; the text has the metrics."""
     samples = recording.samples
     huge = replace(samples, displacement_um=np.where(samples.index % 2, 1.7e308, -1.7e308))
     changed = replace(recording, samples=huge)
