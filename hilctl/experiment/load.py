@@ -75,10 +75,6 @@ class LoadedExperiment:
             stands_um=stands_um,
         )
 
-    def problem(self, key: str, rule: str, value: str = "", hint: str = "") -> ConfigProblem:
-        """Return a broken rule with the place of its key in the file."""
-        return self.document.problem(key, rule, value, hint)
-
     def noise_settings(self, number: int) -> list[str]:
         """Return the settings for other noise of a simulated device in each run of several."""
         seed = self.device.Options.model_fields.get("seed")

@@ -8,7 +8,12 @@ import numpy as np
 from hilctl.base.errors import ConfigProblem, broken
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64, chunks
-from hilctl.models.base import SMALLEST_STROKE, IdentifiedRange, Provenance, stroke_class
+from hilctl.models.base import (
+    SMALLEST_STROKE,
+    HysteresisModel,
+    IdentifiedRange,
+    stroke_class,
+)
 from hilctl.waveforms.build import Reference
 from hilctl.waveforms.shapes import LONG, telling_samples
 
@@ -101,8 +106,11 @@ UNKNOWN = (
 )
 
 
-def range_findings(provenance: Provenance, reference: Reference) -> RangeFindings:
-    """Compare a reference in um with the motions a model was identified on."""
+def range_findings(model: HysteresisModel | None, reference: Reference) -> RangeFindings:
+    """Compare a reference with the motions a model was identified on; find nothing without one."""
+    if model is None or reference.unit != "um":
+        return RangeFindings()
+    provenance = model.provenance
     known = provenance.identified_range
     if known is None:
         return RangeFindings(warnings=(UNKNOWN,))

@@ -50,7 +50,7 @@ from hilctl.experiment.limits import (
     reference_excess,
 )
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.experiment.model_validity import ExpectedError, RangeFindings, range_findings
+from hilctl.experiment.model_validity import ExpectedError, range_findings
 from hilctl.experiment.safe import at_start_problems, start_warnings
 from hilctl.experiment.state_files import MachineTime
 from hilctl.experiment.timing import (
@@ -146,7 +146,7 @@ def check(
     with _refused(loaded, "waveform", problems):
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder, rest)
     _warn_of_long_work(reference)
-    findings = _findings(loaded, reference)
+    findings = range_findings(loaded.model, reference)
     problems += findings.refused
     with _refused(loaded, "compensator.model", problems):
         begun, unknown_start = start_of(loaded, reference, conditioned, now)
@@ -202,12 +202,6 @@ def _rest(loaded: LoadedExperiment) -> float:
     """Return where the waveform rests at the safe value, in its unit."""
     model, safe = loaded.model, loaded.config.safe.value
     return safe if model is None else rests_at(model, loaded.config.sample_rate_hz, safe)
-
-
-def _findings(loaded: LoadedExperiment, reference: Reference) -> RangeFindings:
-    if loaded.model is None or reference.unit != "um":
-        return RangeFindings()
-    return range_findings(loaded.model.provenance, reference)
 
 
 def _span_excess(

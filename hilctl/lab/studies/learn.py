@@ -44,7 +44,7 @@ def repeating(checked: CheckedExperiment) -> list[Segment]:
     loaded = checked.loaded
 
     def refuse(key: str, rule: str, hint: str) -> ConfigError:
-        return ConfigError([loaded.problem(key, rule, hint=hint)])
+        return ConfigError([loaded.document.problem(key, rule, hint=hint)])
 
     if loaded.model is None:
         raise refuse("compensator", "is needed to learn: its input is corrected", "set a model")

@@ -7,6 +7,7 @@ from hilctl.base.segments import Segment
 from hilctl.experiment.model_validity import range_findings, spectrum
 from hilctl.models.base import IdentifiedRange, Provenance
 from hilctl.waveforms.build import Reference
+from tests.published import terfenol_rdpi
 
 RATE_HZ = 10_000.0
 KNOWN = IdentifiedRange(
@@ -19,7 +20,8 @@ def findings(values_um, frequency_hz=0.0):
     segment = Segment("s", 0, values_um.size, 0, values_um.size, period)
     span = float(values_um.min()), float(values_um.max())
     provenance = Provenance(identified_range=KNOWN, errors_by_stroke={"half stroke": 1.5})
-    return range_findings(provenance, Reference(values_um, "um", RATE_HZ, (segment,), span))
+    model = terfenol_rdpi().model_copy(update={"provenance": provenance})
+    return range_findings(model, Reference(values_um, "um", RATE_HZ, (segment,), span))
 
 
 def sine(frequency_hz, amplitude=40.0, seconds=1.0):
@@ -89,5 +91,6 @@ def test_a_slow_model_bounds_the_reference_as_well():
     for frequency_hz, warned, refused in ((1.0, 0, 0), (1.6, 1, 0), (2.5, 0, 1)):
         values_um = sine(frequency_hz, seconds=10.0)
         reference = Reference(values_um, "um", RATE_HZ, (segment,), (-40.0, 40.0))
-        found = range_findings(Provenance(identified_range=slow), reference)
+        known = {"provenance": Provenance(identified_range=slow)}
+        found = range_findings(terfenol_rdpi().model_copy(update=known), reference)
         assert (len(found.warnings), len(found.refused)) == (warned, refused)
