@@ -4,19 +4,16 @@ The inverse maps the measured displacement to the effective field. It has fading
 local error of the table does not affect all later samples.
 """
 
-import math
-from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import numpy as np
-from numpy.polynomial import Polynomial
-from scipy.interpolate import RegularGridInterpolator
 from scipy.linalg import LinAlgError, cho_factor, cho_solve
 
 from hilctl.base.types import F64, I64
-from hilctl.kernels.generalised_duhem import Band, duhem_columns
+from hilctl.kernels.generalised_duhem import duhem_columns
 from hilctl.lab.identify.field.densities import Curve
-from hilctl.lab.identify.field.design_matrix import Motion, chosen, turning_points
+from hilctl.lab.identify.field.design_matrix import chosen, turning_points
+from hilctl.lab.identify.field.duhem_table import Layout, Path, fading, laid_over, prior
 from hilctl.lab.identify.field.preprocess import OFF, Latest, Prepared, histories_of
 from hilctl.lab.identify.field.stages import (
     HIGH,
@@ -34,7 +31,7 @@ from hilctl.lab.identify.field.stages import (
 from hilctl.lab.identify.field.stages import NAMES as STAGES
 from hilctl.lab.identify.fit_api import FitJob, FoundModel, OnProgress, Structure
 from hilctl.lab.identify.parallel import parallel_map
-from hilctl.models.generalised_duhem import GeneralisedDuhemModel, band_of
+from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.staged import StagedModel
 
 POWERS = np.arange(1.0, 5.0)
@@ -59,30 +56,18 @@ STEPS = _row(STEP, 0.05, 0.005)
 FIRST = _row(Stages(field=0.05, output=0.08, decay=0.005), 0.0, 0.0)
 
 
-@dataclass(frozen=True, slots=True)
-class Path:
-    """Points of a record, with all turning points: w, and y before structure and delay."""
-
-    field: F64
-    displacement_um: F64
-    motion: Motion
-
-
 class Signals:
     """Field and displacement of all records."""
 
     def __init__(self, data: Prepared) -> None:
-        self._data = data
-        self._kept: tuple[I64, ...] = ()
-        self._motions: tuple[Motion, ...] = ()
-        self._paths: Latest[list[Path]] = Latest()
+        self.data = data
         measured = np.concatenate([run.derivatives[0] for run in data.runs])
         self._middle_um = 0.5 * float(measured.max() + measured.min())
         self._half_um = 0.5 * float(np.ptp(measured))
 
     def known(self, x: F64) -> Physical:
         """Return the stages of a row in physical units."""
-        return physical(stages_in(x[: len(STAGES)]), self._data)
+        return physical(stages_in(x[: len(STAGES)]), self.data)
 
     def flux(self, x: F64) -> Curve:
         """Return the flux of a row, in um, by displacement."""
@@ -100,18 +85,29 @@ class Signals:
         """Undo :meth:`offset_um`, clipped to the bounds."""
         return float(np.clip((offset_um - first_um) / self._half_um, -_OFFSET, _OFFSET))
 
-    def choose(self, x: F64, way: float, turn: float) -> None:
-        """Choose points of all paths: turns, and at most ``way`` of the command's span apart."""
-        kept, span = [], 2.0 * self._data.reach
-        for field, _ in self._whole(x):
+    def whole(self, x: F64) -> list[tuple[F64, F64]]:
+        """Return field and displacement before structure of all records, for a row."""
+        known, flux = self.known(x), self.flux(x)
+        span = 2.0 * self.data.reach
+        return parallel_map(lambda run: signals(run, known, flux, span), self.data.runs)
+
+
+class Points:
+    """Chosen points of all paths: turns, and at most ``way`` of the command's span apart.
+
+    Paths that return by less than ``turn`` of the span do not turn.
+    """
+
+    def __init__(self, signals: Signals, x: F64, way: float, turn: float) -> None:
+        span, self._signals = 2.0 * signals.data.reach, signals
+        self._kept: list[I64] = []
+        for field, _ in signals.whole(x):
             out = np.empty(field.size, dtype=np.int64)
             count = turning_points(field, way * span, turn * span, out)
-            kept.append(out[:count].copy())
-        self._kept = tuple(kept)
-        self._motions = tuple(
-            run.motion.at(at) for run, at in zip(self._data.runs, kept, strict=True)
-        )
-        self._paths = Latest()
+            self._kept.append(out[:count].copy())
+        runs = signals.data.runs
+        self.motions = [run.motion.at(at) for run, at in zip(runs, self._kept, strict=True)]
+        self._paths: Latest[list[Path]] = Latest()
 
     def paths(self, x: F64) -> list[Path]:
         """Return the paths of all records; cached, so do not change them."""
@@ -119,155 +115,40 @@ class Signals:
 
     def _left(self, x: F64) -> list[Path]:
         return [
-            Path(np.ascontiguousarray(field[kept]), np.ascontiguousarray(y[kept]), motion)
-            for (field, y), kept, motion in zip(
-                self._whole(x), self._kept, self._motions, strict=True
-            )
+            Path(np.ascontiguousarray(field[kept]), np.ascontiguousarray(y[kept]))
+            for (field, y), kept in zip(self._signals.whole(x), self._kept, strict=True)
         ]
-
-    def _whole(self, x: F64) -> list[tuple[F64, F64]]:
-        known, flux = self.known(x), self.flux(x)
-        span = 2.0 * self._data.reach
-        return parallel_map(lambda run: signals(run, known, flux, span), self._data.runs)
-
-
-MARGIN = 0.02  # of the stroke: margin of the table beyond the data
-WIDER = 1.1  # width of the band, of that of the data
-DEGREE = 5  # of the first centre line: the middle of the widest loops would be steep in places
-FLATTEST = 0.2  # minimum slope of the centre, of its mean
-TILT = 0.6  # first guess: change of the logarithm of the slope from centre to edge
-BENT, TILTED = 0.009, 0.0016  # weights of second and first differences, percent of the stroke
-SHORTEST = 0.125  # of a cell: minimum step of a search
-STEEPEST = 5.0  # logarithm of the largest slope, of the mean
 
 
 @dataclass(frozen=True, slots=True)
-class Layout:
-    """Nodes of a table: lowest y and distance, centre of the band at each, and across the band."""
+class Phase:
+    """Rows, limits and end of one phase of the search."""
 
-    lowest_um: float
-    cell_um: float
-    centre: F64
-    half_width: float
-    across: int
-
-    @property
-    def nodes_um(self) -> F64:
-        """Nodes of y."""
-        return np.asarray(self.lowest_um + self.cell_um * np.arange(self.centre.size))
-
-    @property
-    def offsets(self) -> F64:
-        """Nodes across the band, from its centre."""
-        return self.half_width * np.linspace(-1.0, 1.0, self.across)
-
-    @property
-    def slopes(self) -> F64:
-        """Slope of the centre line in each cell, um per command unit: float64[k - 1]."""
-        return np.asarray(self.cell_um / np.diff(self.centre))
-
-    def band(self, logs: F64, flux: F64) -> Band:
-        """Return the operator of logarithms of slopes, float64[2, k, l], with a flux."""
-        lines = np.array([self.centre, flux])
-        slopes, steps, lines, grid = band_of(
-            np.exp(logs), lines, self.lowest_um, self.cell_um, self.half_width
-        )
-        # A search needs no inverse, so its steps may be longer.
-        return slopes, np.maximum(steps, SHORTEST * self.cell_um), lines, grid
-
-    def first_logs(self) -> F64:
-        """Return a first guess of the logarithms: slopes towards the edges: float64[2, k, l]."""
-        middles = self.nodes_um[:-1] + 0.5 * self.cell_um
-        mean = np.log(np.interp(self.nodes_um, middles, self.slopes))[:, None]
-        tilt = TILT * np.linspace(-1.0, 1.0, self.across)
-        return np.stack([mean + tilt - 0.4 * TILT, mean - tilt - 0.4 * TILT])
-
-    def anhysteretic(self, logs: F64) -> F64:
-        """Return w at each node of y where both slopes are equal, in the inner half of the band."""
-        size = self.offsets.size
-        inner = slice(size // 4, size - size // 4)
-        uneven = np.maximum.accumulate(logs[0] - logs[1], axis=1)[:, inner]
-        return self.centre + [np.interp(0.0, row, self.offsets[inner]) for row in uneven]
-
-    def moved(self, logs: F64, other: "Layout") -> F64:
-        """Interpolate a table of another layout at the nodes of this one."""
-        y = np.clip(self.nodes_um, other.nodes_um[0], other.nodes_um[-1])
-        shift = self.centre - np.interp(y, other.nodes_um, other.centre)
-        across = np.clip(
-            self.offsets[None, :] + shift[:, None], -other.half_width, other.half_width
-        )
-        places = np.stack([np.broadcast_to(y[:, None], across.shape), across], axis=-1)
-        axes = (other.nodes_um, other.offsets)
-        return np.stack([RegularGridInterpolator(axes, table)(places) for table in logs])
+    rows: int
+    steps: int  # maximum
+    gain: float  # relative gain of a step that ends the phase
+    held: float  # percent of the stroke per step: penalty of the change of a stage
+    firm: float = 1.0  # factor of the prior
+    fades: bool = False  # whether errors of the field must fade
+    stages: bool = True  # whether stages are searched
 
 
-def laid_over(
-    paths: Sequence[Path], cells: int, across: int, line: tuple[F64, F64] | None = None
-) -> Layout:
-    """Return a layout over the range of paths, with cells of y and across the band.
-
-    The centre is a line through y and w, float64[k] each; a smooth line along the paths if None.
-    """
-    w = np.concatenate([path.field for path in paths])
-    y = np.concatenate([path.displacement_um for path in paths])
-    room = MARGIN * float(np.ptp(y))
-    nodes = np.linspace(float(y.min()) - room, float(y.max()) + room, cells + 1)
-    centre = _extended(nodes, *line) if line else Polynomial.fit(y, w, DEGREE)(nodes)
-    least = FLATTEST * float(np.ptp(centre)) / cells
-    centre = centre[0] + np.concatenate(([0.0], np.cumsum(np.maximum(np.diff(centre), least))))
-    off = float(np.abs(w - np.interp(y, nodes, centre)).max())
-    return Layout(float(nodes[0]), float(nodes[1] - nodes[0]), centre, WIDER * off, across + 1)
-
-
-def _extended(x: F64, knots: F64, values: F64) -> F64:
-    """Interpolate points; extrapolate by the slope over a twentieth of them."""
-    inside = np.interp(x, knots, values)
-    some = max(1, knots.size // 20)
-    first = (values[some] - values[0]) / (knots[some] - knots[0])
-    last = (values[-1] - values[-1 - some]) / (knots[-1] - knots[-1 - some])
-    below, above = np.minimum(x - knots[0], 0.0), np.maximum(x - knots[-1], 0.0)
-    return np.asarray(inside + first * below + last * above)
-
-
-def prior(layout: Layout) -> F64:
-    """Return rows of the smoothness prior: float64[K, 2 k l]."""
-    shape = 2, layout.centre.size, layout.across
-    nodes = np.eye(math.prod(shape)).reshape(*shape, -1)
-    parts = [
-        weight * np.diff(nodes, order, axis).reshape(-1, nodes.shape[-1])
-        for axis in (1, 2)
-        for order, weight in ((2, BENT), (1, TILTED))
-    ]
-    return np.vstack(parts)
-
-
-def fading(logs: F64) -> F64:
-    """Return monotonic logarithms: with w, rising branches get steeper and falling ones flatter.
-
-    So an error of the field fades; otherwise it would grow with each small loop.
-    """
-    ways = np.stack((logs[0], -logs[1]))
-    above = np.maximum.accumulate(ways, axis=2)
-    below = np.minimum.accumulate(ways[:, :, ::-1], axis=2)[:, :, ::-1]
-    middle = 0.5 * (above + below)
-    return np.stack((middle[0], -middle[1]))
-
-
+# The misfit of a coarse table is larger than the effect of some stages, so these are held firmly.
+COARSE = Phase(rows=4000, steps=18, gain=3e-2, held=1e-2, fades=True)
+# Without a strong prior, first steps bring slopes that few loops reach to extreme values, from
+# which the search does not return.
+TABLE_ALONE = replace(COARSE, steps=3, gain=0.0, firm=3000.0, stages=False)
+FINE = Phase(rows=12_000, steps=8, gain=3e-3, held=3e-4)
+COARSE_CELLS = (12, 8)  # of the first table
 COARSE_WAY, FINE_WAY = 0.03, 0.02  # maximum distance of two points of a path, of the span
 COARSE_TURN, FINE_TURN = 3e-3, 1e-3  # of the span: minimum return after a turn
-COARSE_ROWS, FINE_ROWS = 4000, 12_000
-COARSE = (12, 8)  # cells of the first table
-FIRM = 3000.0  # factor of the prior for the first steps
-TABLE_ALONE = 3  # first steps, with constant stages
-STEPS_COARSE, STEPS_FINE = 18, 8
-COARSE_GAIN, FINE_GAIN = 3e-2, 3e-3  # relative gain of a step that ends the search
+STEEPEST = 5.0  # logarithm of the largest slope, of the mean
 SHORT_GAIN = 0.03  # factor of the gain, if the damping of the step was raised
 TRIALS = 12  # dampings of a step; a start that is far off needs the largest
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9
 REFUSED_DAMPING = 1e-5  # minimum after a rejected step
 TRUSTED = 0.1  # of the gain predicted by the derivatives: a step that gains less is rejected
 DIFFERENCE = 0.2  # step of numerical derivatives, of the step of a stage
-COARSE_HELD, HELD = 1e-2, 3e-4  # percent of the stroke per step: penalty of the change of a stage
 
 
 @dataclass(frozen=True, slots=True)
@@ -283,104 +164,53 @@ class DuhemEnd:
     at_bound: tuple[str, ...]
 
 
-class DuhemSearch:
-    """Search of table and stages, with slopes of at least ``least`` um per command unit."""
+@dataclass(frozen=True, slots=True)
+class Bounds:
+    """Bounds of search variables and of logarithms of slopes, and where stages are held."""
+
+    low: F64
+    high: F64
+    first: F64
+    logs: tuple[float, float]
+
+
+class DuhemProblem:
+    """Errors of a table of one layout and of stages, and their descent.
+
+    Errors are those of the field at chosen rows of the paths, in percent of the stroke over the
+    root of their number. ``first_um`` is a first guess of the displacement at rest.
+    """
 
     def __init__(
-        self, data: Prepared, cells: int, across: int, least: float, structure: Structure = True
+        self,
+        signals: Signals,
+        points: Points,
+        layout: Layout,
+        first_um: float,
+        bounds: Bounds,
+        phase: Phase,
     ) -> None:
-        self._data, self._stroke_um = data, data.stroke_um
-        self._space = StageSpace.of(data, structure)
-        self._low, self._high = LOWEST.copy(), HIGHEST.copy()
-        self._low[: len(STAGES)], self._high[: len(STAGES)] = self._space.low, self._space.high
-        self._first = np.clip(FIRST, self._low, self._high)
-        self._signals = Signals(data)
-        self._size = cells, across
-        # The misfit of a coarse table is larger than the effect of some stages.
-        self._held, self._fades = COARSE_HELD**2, False
-        mean = np.log(data.stroke_um / (2.0 * data.reach))
-        self._log_range = float(np.log(least)), float(mean + STEEPEST)
-
-    @property
-    def free(self) -> int:
-        """Number of search variables that are not fixed."""
-        return int(np.count_nonzero(self._low < self._high))
-
-    def find(self, progress: OnProgress) -> DuhemEnd:
-        """Search with a coarse table, then with the requested size."""
-        x = self._first.copy()
-        paths = self._chosen(x, COARSE_WAY, COARSE_TURN, COARSE_ROWS)
-        self._lay(laid_over(paths, *COARSE))
-        self._first_um = self._rest_um(paths[0])
-        logs = self._layout.first_logs()
-        # Without a strong prior, first steps bring slopes that few loops reach to extreme values,
-        # from which the search does not return.
-        self._prior = FIRM * self._smooth
-        self._fades = True
-        x, logs = self._descend(x, logs, TABLE_ALONE, 0.0, stages=False)
-        progress(0.1, "a coarse table")
-        self._prior = self._smooth
-        x, logs = self._descend(x, logs, STEPS_COARSE, COARSE_GAIN)
-        self._fades = False
-        progress(0.5, "the table")
-        return self._end(x, logs, self._layout)
-
-    def go_on(self, end: DuhemEnd) -> DuhemEnd:
-        """Return the end of a search from the end of one with another table or data."""
-        stages = self._space.within(stages_of(end.known, self._data))
-        x = np.concatenate((stages, end.x[len(STAGES) :]))
-        path = self._chosen(x, COARSE_WAY, COARSE_TURN, COARSE_ROWS)[0]
-        self._layout = end.layout
-        self._first_um = self._rest_um(path)
-        x[-1] = self._signals.offset_in(end.offset_um, self._first_um)
-        return self._end(x, end.logs, end.layout)
-
-    def _end(self, x: F64, logs: F64, before: Layout) -> DuhemEnd:
-        """Search with a table of the requested size, from another table."""
-        self._held = HELD**2
-        # Slopes have a kink on the anhysteretic line, which nodes represent and cells would not.
-        line = before.nodes_um, before.anhysteretic(logs)
-        self._lay(laid_over(self._chosen(x, FINE_WAY, FINE_TURN, FINE_ROWS), *self._size, line))
-        x, logs = self._descend(x, self._layout.moved(logs, before), STEPS_FINE, FINE_GAIN)
-        offset_um = self._signals.offset_um(x, self._first_um)
-        known, flux = self._signals.known(x), self._signals.flux(x)
-        held = self._space.at_bound(stages_in(x[: len(STAGES)]))
-        return DuhemEnd(known, self._layout, logs, flux, offset_um, x, held)
-
-    def _chosen(self, x: F64, way: float, turn: float, rows: int) -> list[Path]:
-        self._signals.choose(x, way, turn)
-        paths = self._signals.paths(x)
-        self._rows = chosen([path.motion for path in paths], rows)
-        self._count = self._rows.scale.size
-        return paths
-
-    def _lay(self, layout: Layout) -> None:
-        self._layout = layout
+        self.layout = layout
+        self._signals, self._points, self._first_um = signals, points, first_um
+        self._bounds, self._phase, self._held = bounds, phase, phase.held**2
+        self.rows = chosen(points.motions, phase.rows)
+        self._count = self.rows.scale.size
+        self._prior = phase.firm * prior(layout)
         self._fields: Latest[F64] = Latest()
-        rows = prior(layout)
-        self._smooth: F64 = rows.T @ rows
-        self._prior = self._smooth
 
-    def _rest_um(self, path: Path) -> float:
-        """Return the displacement at zero field, from the first point and the centre line."""
-        layout = self._layout
-        ends = np.interp([path.field[0], 0.0], layout.centre, layout.nodes_um)
-        return float(path.displacement_um[0] + ends[1] - ends[0])
-
-    def _descend(
-        self, x: F64, logs: F64, most: int, enough: float, *, stages: bool = True
-    ) -> tuple[F64, F64]:
-        """Take up to ``most`` steps, until the relative gain is at most ``enough``."""
-        errors, damping = self._errors(x, logs), FIRST_DAMPING
+    def descend(self, x: F64, logs: F64) -> tuple[F64, F64]:
+        """Take up to ``phase.steps`` steps, until the relative gain is at most ``phase.gain``."""
+        errors, damping = self.errors(x, logs), FIRST_DAMPING
         cost = self._cost(x, logs, errors)
-        for _ in range(most):
-            normal, down = self._normal(x, logs, errors, stages=stages)
+        for _ in range(self._phase.steps):
+            normal, down = self._normal(x, logs, errors)
             first = damping
             for _ in range(TRIALS):
-                step = _bounded_step(normal, down, damping, logs.size, x, (self._low, self._high))
+                low, high = self._bounds.low, self._bounds.high
+                step = _bounded_step(normal, down, damping, logs.size, x, (low, high))
                 if step is not None:
                     to_x, to_logs = self._stepped(x, logs, step)
-                    to_errors = self._errors(to_x, to_logs)
+                    to_errors = self.errors(to_x, to_logs)
                     to_cost = self._cost(to_x, to_logs, to_errors)
                     if cost - to_cost > TRUSTED * float(step @ (2.0 * down - normal @ step)):
                         break
@@ -390,52 +220,58 @@ class DuhemSearch:
             gained = 1.0 - to_cost / cost
             x, logs, errors, cost = to_x, to_logs, to_errors, to_cost
             # The gain of a short step, after rejected ones, does not tell what is left to gain.
-            if gained <= (enough if damping == first else SHORT_GAIN * enough):
+            if gained <= self._phase.gain * (1.0 if damping == first else SHORT_GAIN):
                 break
             damping = max(0.1 * damping, LEAST_DAMPING)
         return x, logs
 
     def _stepped(self, x: F64, logs: F64, step: F64) -> tuple[F64, F64]:
         table = logs + np.clip(step[: logs.size], -1.0, 1.0).reshape(logs.shape)
-        stages = x + step[logs.size :] * STEPS if step.size > logs.size else x
-        table = np.clip(table, *self._log_range)
-        return np.clip(stages, self._low, self._high), fading(table) if self._fades else table
+        table = np.clip(table, *self._bounds.logs)
+        stages = x + step[logs.size :] * STEPS if self._phase.stages else x
+        stages = np.clip(stages, self._bounds.low, self._bounds.high)
+        return stages, fading(table) if self._phase.fades else table
+
+    def _moved(self, x: F64) -> F64:
+        """Return the change of stages from where they are held, in steps."""
+        return np.asarray((x - self._bounds.first) / STEPS)
 
     def _cost(self, x: F64, logs: F64, errors: F64) -> float:
-        held = logs.ravel() @ self._prior @ logs.ravel()
-        moved = (x - self._first) / STEPS
+        held, moved = logs.ravel() @ self._prior @ logs.ravel(), self._moved(x)
         return float(errors @ errors + held + self._held * (moved @ moved))
 
-    def _normal(self, x: F64, logs: F64, errors: F64, *, stages: bool) -> tuple[F64, F64]:
+    def _normal(self, x: F64, logs: F64, errors: F64) -> tuple[F64, F64]:
         """Return the normal equations of a step (table first, then stages)."""
-        size = logs.size
-        slopes = np.empty((errors.size, size + (len(NAMES) if stages else 0)))
-        slopes[:, :size] = self._by_table(x, logs)
-        for k in reversed(range(size, slopes.shape[1])):  # the offset first: paths are still cached
-            there, stage = x.copy(), k - size
-            if self._low[stage] == self._high[stage]:
-                slopes[:, k] = 0.0
-                continue
-            step = DIFFERENCE * STEPS[stage]
-            there[stage] += step if x[stage] + step <= self._high[stage] else -step
-            change = self._errors(there, logs) - errors
-            slopes[:, k] = change * (STEPS[stage] / (there[stage] - x[stage]))
+        size, stages = logs.size, len(NAMES) if self._phase.stages else 0
+        slopes = np.empty((errors.size, size + stages))
+        slopes[:, :size] = self.by_table(x, logs)
+        for stage in reversed(range(stages)):  # the offset first: paths are still cached
+            slopes[:, size + stage] = self._by_stage(x, logs, errors, stage)
         normal, down = slopes.T @ slopes, -(slopes.T @ errors)
         normal[:size, :size] += self._prior
         down[:size] -= self._prior @ logs.ravel()
         if stages:
             normal[range(size, len(normal)), range(size, len(normal))] += self._held
-            down[size:] -= self._held * (x - self._first) / STEPS
+            down[size:] -= self._held * self._moved(x)
         return normal, down
 
-    def _errors(self, x: F64, logs: F64) -> F64:
-        """Return weighted errors in percent of the stroke over the root of their number."""
+    def _by_stage(self, x: F64, logs: F64, errors: F64, stage: int) -> F64 | float:
+        """Return the derivatives of the errors by a stage, per step: float64[N]."""
+        if self._bounds.low[stage] == self._bounds.high[stage]:
+            return 0.0
+        there, step = x.copy(), DIFFERENCE * STEPS[stage]
+        there[stage] += step if x[stage] + step <= self._bounds.high[stage] else -step
+        change = self.errors(there, logs) - errors
+        return np.asarray(change * (STEPS[stage] / (there[stage] - x[stage])))
+
+    def errors(self, x: F64, logs: F64) -> F64:
+        """Return the weighted errors: float64[N]."""
         # Most stages change the measured field alone.
         key = x[_OF_OPERATOR].tobytes(), logs.tobytes()
         fields = self._fields.of(key, lambda: self._followed(x, logs, np.empty((self._count, 0))))
         return np.asarray(self._scale(x) * (fields - self._at_rows(x, "field")))
 
-    def _by_table(self, x: F64, logs: F64) -> F64:
+    def by_table(self, x: F64, logs: F64) -> F64:
         """Return the derivatives of the errors by the logarithms: float64[N, 2 k l]."""
         columns = np.empty((self._count, logs.size))
         self._followed(x, logs, columns)
@@ -444,15 +280,13 @@ class DuhemSearch:
 
     def _scale(self, x: F64) -> F64:
         """Return the weight of each row's field, in percent of the stroke: float64[N]."""
-        layout = self._layout
-        middles = layout.nodes_um[:-1] + 0.5 * layout.cell_um
-        slope = np.interp(self._at_rows(x, "displacement_um"), middles, layout.slopes)
-        to_percent = 100.0 / self._stroke_um / np.sqrt(self._count)
-        return np.asarray(to_percent * slope * self._rows.scale)
+        slope = self.layout.slopes_at(self._at_rows(x, "displacement_um"))
+        to_percent = 100.0 / self._signals.data.stroke_um / np.sqrt(self._count)
+        return np.asarray(to_percent * slope * self.rows.scale)
 
     def _at_rows(self, x: F64, signal: str) -> F64:
         """Return a signal of the paths at all rows: float64[N]."""
-        parts = zip(self._signals.paths(x), self._rows.samples, strict=True)
+        parts = zip(self._points.paths(x), self.rows.samples, strict=True)
         return np.concatenate([getattr(path, signal)[rows] for path, rows in parts])
 
     def _followed(self, x: F64, logs: F64, columns: F64) -> F64:
@@ -461,9 +295,9 @@ class DuhemSearch:
         ``columns`` is float64[N, m], filled with its derivatives by the logarithms; m may be 0.
         """
         start_um = self._signals.offset_um(x, self._first_um)
-        flux = np.arange(self._layout.centre.size, dtype=np.float64)  # not used by the inverse
-        band = self._layout.band(logs, flux)
-        samples = self._rows.samples
+        flux = np.arange(self.layout.centre.size, dtype=np.float64)  # not used by the inverse
+        band = self.layout.band(logs, flux)
+        samples = self.rows.samples
         ends = np.cumsum([rows.size for rows in samples]).tolist()
         fields = np.empty(self._count)
 
@@ -473,9 +307,63 @@ class DuhemSearch:
             duhem_columns(path.displacement_um, start_um, 0.0, band, rows, w, columns[here])
             fields[here] = w[rows]
 
-        parts = zip(self._signals.paths(x), samples, ends, strict=True)
+        parts = zip(self._points.paths(x), samples, ends, strict=True)
         parallel_map(lambda part: follow(*part), parts)
         return fields
+
+
+class DuhemSearch:
+    """Search of table and stages, with slopes of at least ``least`` um per command unit."""
+
+    def __init__(
+        self, data: Prepared, cells: int, across: int, least: float, structure: Structure = True
+    ) -> None:
+        self._data, self._size = data, (cells, across)
+        self._signals, self._space = Signals(data), StageSpace.of(data, structure)
+        low, high = LOWEST.copy(), HIGHEST.copy()
+        low[: len(STAGES)], high[: len(STAGES)] = self._space.low, self._space.high
+        mean = np.log(data.stroke_um / (2.0 * data.reach))
+        logs = float(np.log(least)), float(mean + STEEPEST)
+        self._bounds = Bounds(low, high, np.clip(FIRST, low, high), logs)
+
+    @property
+    def free(self) -> int:
+        """Number of search variables that are not fixed."""
+        return int(np.count_nonzero(self._bounds.low < self._bounds.high))
+
+    def find(self, progress: OnProgress) -> DuhemEnd:
+        """Search with a coarse table, then with the requested size."""
+        x = self._bounds.first.copy()
+        points = Points(self._signals, x, COARSE_WAY, COARSE_TURN)
+        layout = laid_over(points.paths(x), *COARSE_CELLS)
+        first_um = layout.rest_um(*self._signals.whole(x)[0])
+        logs = layout.first_logs()
+        for phase, done, text in ((TABLE_ALONE, 0.1, "a coarse table"), (COARSE, 0.5, "the table")):
+            problem = DuhemProblem(self._signals, points, layout, first_um, self._bounds, phase)
+            x, logs = problem.descend(x, logs)
+            progress(done, text)
+        return self._end(x, logs, layout, first_um)
+
+    def go_on(self, end: DuhemEnd) -> DuhemEnd:
+        """Return the end of a search from the end of one with another table or data."""
+        stages = self._space.within(stages_of(end.known, self._data))
+        x = np.concatenate((stages, end.x[len(STAGES) :]))
+        first_um = end.layout.rest_um(*self._signals.whole(x)[0])
+        x[-1] = self._signals.offset_in(end.offset_um, first_um)
+        return self._end(x, end.logs, end.layout, first_um)
+
+    def _end(self, x: F64, logs: F64, before: Layout, first_um: float) -> DuhemEnd:
+        """Search with a table of the requested size, from another table."""
+        points = Points(self._signals, x, FINE_WAY, FINE_TURN)
+        # Slopes have a kink on the anhysteretic line, which nodes represent and cells would not.
+        line = before.nodes_um, before.anhysteretic(logs)
+        layout = laid_over(points.paths(x), *self._size, line)
+        fine = DuhemProblem(self._signals, points, layout, first_um, self._bounds, FINE)
+        x, logs = fine.descend(x, layout.moved(logs, before))
+        offset_um = self._signals.offset_um(x, first_um)
+        known, flux = self._signals.known(x), self._signals.flux(x)
+        held = self._space.at_bound(stages_in(x[: len(STAGES)]))
+        return DuhemEnd(known, layout, logs, flux, offset_um, x, held)
 
 
 def _bounded_step(

@@ -11,6 +11,7 @@ from hilctl.base.types import F64
 from hilctl.lab.identify.data.records import History, SteadyLoop
 from hilctl.lab.identify.evaluation import judge
 from hilctl.lab.identify.field.duhem_search import (
+    FINE,
     FIRST,
     FLUX,
     HIGHEST,
@@ -19,15 +20,16 @@ from hilctl.lab.identify.field.duhem_search import (
     POINTS,
     POWERS,
     STEPS,
-    WIDER,
+    Bounds,
     DuhemEnd,
+    DuhemProblem,
     DuhemSearch,
-    Layout,
-    Path,
+    Phase,
+    Points,
     Signals,
     _bounded_step,
-    laid_over,
 )
+from hilctl.lab.identify.field.duhem_table import WIDER, Layout, Path, laid_over
 from hilctl.lab.identify.field.preprocess import OFF, Prepared
 from hilctl.lab.identify.fit_api import FitRequest
 from hilctl.lab.identify.fit_model import FittedModel, fit_model
@@ -69,7 +71,7 @@ def loops() -> Path:
     """Return loops that grow to the full range, 0.5 wide either side of a curve."""
     y = 50.0 * np.minimum(TURNS / 30.0, 1.0) * np.sin(TURNS) - 10.0
     field = 0.1 * y + 2e-4 * y**2 + 0.5 * np.cos(TURNS)
-    return Path(field, y, 0)
+    return Path(field, y)
 
 
 def layout(cells: int = 12, across: int = 6) -> Layout:
@@ -94,14 +96,14 @@ def test_the_centre_is_the_middle_of_the_loops_and_the_band_holds_all():
 
 def test_displacements_that_no_path_comes_by_lie_between_those_that_one_does():
     y = np.concatenate([np.linspace(0.0, 10.0, 400), np.linspace(40.0, 50.0, 400)])
-    here = laid_over([Path(0.1 * y, y, 0)], 10, 4)
+    here = laid_over([Path(0.1 * y, y)], 10, 4)
     assert here.centre == pytest.approx(0.1 * here.nodes_um, abs=0.05)
 
 
 def test_the_centre_rises_though_loops_are_upright():
     y = np.concatenate([np.linspace(0.0, 40.0, 400), np.linspace(40.0, 0.0, 400)])
     field = np.concatenate([np.linspace(0.0, 4.0, 400), np.full(400, 4.0)])
-    here = laid_over([Path(field, y, 0)], 10, 4)
+    here = laid_over([Path(field, y)], 10, 4)
     assert (np.diff(here.centre) > 0.0).all()
 
 
@@ -109,7 +111,7 @@ def test_a_few_wide_loops_do_not_bend_the_centre():
     """As the loops of the fastest sines, whose losses are not known yet."""
     narrow, turns = loops(), np.linspace(0.0, 2.0 * np.pi, 400)
     y = -10.0 + 25.0 * np.sin(turns)
-    wide = Path(0.1 * y + 2e-4 * y**2 + 4.0 * np.cos(turns) * (np.cos(turns) > 0.0), y, 0)
+    wide = Path(0.1 * y + 2e-4 * y**2 + 4.0 * np.cos(turns) * (np.cos(turns) > 0.0), y)
     here = laid_over([narrow, wide], 12, 6)
     assert here.slopes.max() < 2.0 * here.slopes.min()
 
@@ -162,12 +164,11 @@ def test_the_flux_can_be_a_root_of_the_strain_nearly_down_to_where_that_begins()
 def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for():
     records = data()
     signals, (run,) = Signals(records), records.runs
-    signals.choose(FIRST, 1e-9, 0.0)
-    (path,) = signals.paths(FIRST)
+    points = Points(signals, FIRST, 1e-9, 0.0)
+    (path,), (motion,) = points.paths(FIRST), points.motions
     assert path.field.size == path.displacement_um.size == run.kept.size
-    assert path.motion.judged.size == path.field.size
-    signals.choose(FIRST, 0.05, 1e-3)
-    (coarse,) = signals.paths(FIRST)
+    assert motion.judged.size == path.field.size
+    (coarse,) = Points(signals, FIRST, 0.05, 1e-3).paths(FIRST)
     assert coarse.field.size < path.field.size / 2
     between = np.abs(np.diff(path.field)).max()
     assert np.abs(np.diff(coarse.field)).max() <= 0.05 * 2.0 * records.reach + between
@@ -178,9 +179,7 @@ def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for():
 
 @pytest.mark.parametrize("stage", [k for k, name in enumerate(NAMES) if name != "activation"])
 def test_paths_follow_every_stage_but_the_offset(stage):
-    kept, fresh = Signals(data()), Signals(data())
-    for signals in (kept, fresh):
-        signals.choose(FIRST, 0.02, 1e-3)
+    kept, fresh = (Points(Signals(data()), FIRST, 0.02, 1e-3) for _ in range(2))
     (before,) = kept.paths(FIRST)
     x = FIRST.copy()
     x[stage] += STEPS[stage]
@@ -198,27 +197,29 @@ def test_paths_follow_every_stage_but_the_offset(stage):
 SETTINGS = FitSettings(kind="generalised_duhem", cells=10, across=8)
 
 
-def ready(unit: float = 1.0, um: float = 1.0) -> tuple[DuhemSearch, F64]:
-    """Return a search with a table laid, and its first logarithms."""
-    job = DuhemSearch(data(unit, um), 8, 6, 0.05 * um / unit)
-    job._lay(laid_over(job._chosen(FIRST, 0.03, 1e-3, 500), 8, 6))
-    job._first_um = 0.7 * um
-    return job, job._layout.first_logs()
+def ready(unit: float = 1.0, um: float = 1.0, steps: int = 3) -> tuple[DuhemProblem, F64]:
+    """Return a problem, and its first logarithms."""
+    signals = Signals(data(unit, um))
+    points = Points(signals, FIRST, 0.03, 1e-3)
+    here = laid_over(points.paths(FIRST), 8, 6)
+    bounds = Bounds(LOWEST, HIGHEST, FIRST, (float(np.log(0.05 * um / unit)), 10.0))
+    phase = Phase(rows=500, steps=steps, gain=0.0, held=1e-2)
+    return DuhemProblem(signals, points, here, 0.7 * um, bounds, phase), here.first_logs()
 
 
 def test_slopes_are_those_of_the_errors():
     job, logs = ready()
-    errors = job._errors(FIRST, logs)
-    slopes = job._by_table(FIRST, logs)
+    errors = job.errors(FIRST, logs)
+    slopes = job.by_table(FIRST, logs)
     way = np.random.default_rng(1).standard_normal(logs.shape)
-    change = (job._errors(FIRST, logs + 1e-5 * way) - errors) / 1e-5
+    change = (job.errors(FIRST, logs + 1e-5 * way) - errors) / 1e-5
     assert slopes @ way.ravel() == pytest.approx(change, abs=0.02 * np.abs(change).max())
 
 
 def test_some_steps_lessen_the_error():
-    job, logs = ready()
-    x, better = job._descend(FIRST, logs, 5, 0.0)
-    first, last = (job._errors(*at) for at in ((FIRST, logs), (x, better)))
+    job, logs = ready(steps=5)
+    x, better = job.descend(FIRST, logs)
+    first, last = (job.errors(*at) for at in ((FIRST, logs), (x, better)))
     assert last @ last < 0.2 * (first @ first)
 
 
@@ -257,8 +258,8 @@ def test_a_descent_goes_on_where_the_first_damping_is_too_little(monkeypatch):
         return None if len(dampings) == 1 else _bounded_step(normal, down, damping, *others)
 
     monkeypatch.setattr("hilctl.lab.identify.field.duhem_search._bounded_step", refusing)
-    x, better = job._descend(FIRST, logs, 2, 0.0)
-    first, last = (job._errors(*at) for at in ((FIRST, logs), (x, better)))
+    x, better = job.descend(FIRST, logs)
+    first, last = (job.errors(*at) for at in ((FIRST, logs), (x, better)))
     assert dampings[1] > dampings[0]
     assert last @ last < first @ first
 
@@ -266,35 +267,39 @@ def test_a_descent_goes_on_where_the_first_damping_is_too_little(monkeypatch):
 def test_a_step_that_gains_too_little_of_its_prediction_is_rejected(monkeypatch):
     job, logs = ready()
     monkeypatch.setattr("hilctl.lab.identify.field.duhem_search.TRUSTED", 10.0)
-    x, same = job._descend(FIRST, logs, 2, 0.0)
+    x, same = job.descend(FIRST, logs)
     assert (x == FIRST).all()
     assert (same == logs).all()
 
 
 def test_units_make_no_difference():
     (job, first), (other_job, other_first) = ready(), ready(4.0, 2.0)
-    x, logs = job._descend(FIRST, first, 3, 0.0)
-    other_x, other_logs = other_job._descend(FIRST, other_first, 3, 0.0)
+    x, logs = job.descend(FIRST, first)
+    other_x, other_logs = other_job.descend(FIRST, other_first)
     assert other_x == pytest.approx(x, abs=1e-4)
     assert other_logs - np.log(0.5) == pytest.approx(logs, abs=1e-2)
 
 
-def field_errors(job: DuhemSearch, end: DuhemEnd) -> F64:
-    """Return weighted errors of the field; those of a search are scaled by its own centre line."""
-    layout, paths = end.layout, job._signals.paths(end.x)
-    middles = layout.nodes_um[:-1] + 0.5 * layout.cell_um
-    rows = zip(paths, job._rows.samples, strict=True)
-    y = np.concatenate([path.displacement_um[samples] for path, samples in rows])
-    return job._errors(end.x, end.logs) / np.interp(y, middles, layout.slopes)
+def spread(end: DuhemEnd) -> float:
+    """Return the rms error of the field at the end of a search of the record."""
+    (run,) = data().runs
+    signals = Signals(data())
+    points = Points(signals, end.x, 0.02, 1e-3)
+    bounds = Bounds(LOWEST, HIGHEST, FIRST, (-10.0, 10.0))
+    first_um = end.offset_um - float(end.x[-1]) * 0.5 * float(np.ptp(run.derivatives[0]))
+    job = DuhemProblem(signals, points, end.layout, first_um, bounds, FINE)
+    (path,), (rows,) = points.paths(end.x), job.rows.samples
+    # Errors of a problem are scaled by its own centre line.
+    slopes = end.layout.slopes_at(path.displacement_um[rows])
+    return float(np.std(job.errors(end.x, end.logs) / slopes))
 
 
 def test_a_search_that_goes_on_from_a_rougher_one_ends_no_worse():
     rough = DuhemSearch(data(), 5, 3, 0.05).find(lambda *_: None)
-    whole, after = (DuhemSearch(data(), 10, 8, 0.05) for _ in range(2))
-    fine, end = whole.find(lambda *_: None), after.go_on(rough)
-    spread, other = (np.std(field_errors(job, at)) for job, at in ((whole, fine), (after, end)))
+    fine = DuhemSearch(data(), 10, 8, 0.05).find(lambda *_: None)
+    end = DuhemSearch(data(), 10, 8, 0.05).go_on(rough)
     assert end.logs.shape == fine.logs.shape
-    assert other < 1.1 * spread
+    assert spread(end) < 1.1 * spread(fine)
     assert end.offset_um == pytest.approx(fine.offset_um, abs=0.05)
 
 
