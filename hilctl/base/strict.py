@@ -2,7 +2,7 @@
 
 import re
 from collections.abc import Iterable, Mapping
-from typing import ClassVar, Self
+from typing import Any, ClassVar, Self
 
 from pydantic import (
     AfterValidator,
@@ -10,6 +10,7 @@ from pydantic import (
     BeforeValidator,
     ConfigDict,
     Field,
+    PlainSerializer,
     PrivateAttr,
     StringConstraints,
     ValidationError,
@@ -19,11 +20,13 @@ from pydantic import (
     model_validator,
 )
 from pydantic_core import ErrorDetails
+from pydantic_core import PydanticKnownError as KnownError
 
 __all__ = [
-    "HALF_CHARACTER", "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "PrivateAttr",
-    "StrictModel", "StringConstraints", "ValidationError", "ValidationInfo", "WithJsonSchema",
-    "field_validator", "first_problem", "model_validator", "without_halves",
+    "HALF_CHARACTER", "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "KnownError",
+    "PlainSerializer", "PrivateAttr", "StrictModel", "StringConstraints", "ValidationError",
+    "ValidationInfo", "WithJsonSchema", "field_validator", "first_problem", "model_validator",
+    "without_halves",
 ]  # fmt: skip
 
 
@@ -99,6 +102,11 @@ class StrictModel(BaseModel):
     """Keys of earlier releases, each with what to do."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
+
+    @classmethod
+    def described_by(cls, data: Any) -> "type[StrictModel]":
+        """Return the class that validates data: a subclass if the data name one."""
+        return cls
 
 
 class CheckedModel(StrictModel):

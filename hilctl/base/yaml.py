@@ -33,7 +33,7 @@ from yaml.composer import ComposerError
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
-from hilctl.base.strict import HALF_CHARACTER, WORDS, expected, rule_of
+from hilctl.base.strict import HALF_CHARACTER, WORDS, StrictModel, expected, rule_of
 
 Loc: TypeAlias = tuple[str | int, ...]
 """Location of a value: keys and list indices."""
@@ -80,15 +80,19 @@ def loc_of(key: str) -> Loc:
 
 
 def broken_rules(
-    error: ValidationError, model: type[BaseModel], where: Callable[[Loc], str], at: Loc = ()
+    error: ValidationError,
+    model: type[BaseModel],
+    where: Callable[[Loc], str],
+    at: Loc = (),
+    data: Any = None,
 ) -> list[ConfigProblem]:
     """Return all validation errors of a file, one problem per value.
 
     ``where`` returns the ``file:line`` of a location, or of its nearest parent; ``at`` is the
-    location of the model's data in the file.
+    location of the model's ``data`` in the file.
     """
     problems: list[ConfigProblem] = []
-    broken = [_located(model, detail) for detail in error.errors(include_url=False)]
+    broken = [_located(model, detail, data) for detail in error.errors(include_url=False)]
     # Ignore type errors of union members if another member matched the type.
     meant = {
         each.loc[:n] for each in broken if not each.of_choice for n in range(len(each.loc) + 1)
@@ -179,7 +183,7 @@ def _is_number(text: str) -> bool:
     return any(re.fullmatch(pattern, text) for pattern in NUMBERS.values())
 
 
-def _located(model: type[BaseModel], detail: ErrorDetails) -> _Broken:
+def _located(model: type[BaseModel], detail: ErrorDetails, data: Any) -> _Broken:
     """Map pydantic's location to the file, without its names of union members."""
     choices: list[Any] = [model]
     parent: type[BaseModel] | None = None
@@ -191,8 +195,9 @@ def _located(model: type[BaseModel], detail: ErrorDetails) -> _Broken:
             choices = [choice for choice in choices if _is_named(choice, part)]
         elif part != "[key]":
             plain.append(part)
-            parent = choices[0] if choices and _is_model(choices[0]) else None
-            choices = _choices(_inner(choices[0], part)) if choices else []
+            parent = _described(choices[0], data) if choices and _is_model(choices[0]) else None
+            choices = _choices(_inner(parent or choices[0], part)) if choices else []
+            data = _value_at(data, part)
     kind = detail["type"]
     if kind == "union_tag_invalid":
         plain.append("kind")
@@ -201,6 +206,17 @@ def _located(model: type[BaseModel], detail: ErrorDetails) -> _Broken:
     if kind == "union_tag_not_found":
         kinds = tuple(name for each in choices for name in _kinds(each))
     return _Broken(detail, tuple(plain), parent, of_choice, kinds)
+
+
+def _described(model: type[BaseModel], data: Any) -> type[BaseModel]:
+    return model.described_by(data) if issubclass(model, StrictModel) else model
+
+
+def _value_at(data: Any, part: str | int) -> Any:
+    """Return the value at a key or index; None without one."""
+    if isinstance(data, tuple):
+        return data[part] if isinstance(part, int) and part < len(data) else None
+    return data.get(part) if isinstance(data, Mapping) else None
 
 
 def _is_model(annotation: Any) -> bool:
@@ -528,7 +544,7 @@ class Document:
         try:
             return model.model_validate(data, context=context)
         except ValidationError as error:
-            raise ConfigError(broken_rules(error, model, self.where, at)) from None
+            raise ConfigError(broken_rules(error, model, self.where, at, data)) from None
 
 
 def load_document(path: Path, files: TextFiles | None = None) -> Document:

@@ -3,17 +3,27 @@
 import math
 from abc import ABC, abstractmethod
 from collections.abc import Callable, Iterator, Mapping
-from typing import Annotated, Any, Self, TypeAlias
+from typing import Annotated, Any, ClassVar, Self, TypeAlias
 
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.base.errors import ModelError
+from hilctl.base.errors import InputError, ModelError
 from hilctl.base.formatting import shown_briefly
-from hilctl.base.strict import CheckedModel, Field, StrictModel, field_validator, model_validator
+from hilctl.base.strict import (
+    CheckedModel,
+    Field,
+    KnownError,
+    PlainSerializer,
+    StrictModel,
+    ValidationInfo,
+    field_validator,
+    model_validator,
+)
 from hilctl.base.types import F64, CommandUnit
 from hilctl.kernels.hysteresis import rest_memory
 from hilctl.kernels.jit import compiled
+from hilctl.models import kinds
 
 MAX_OPERATORS = 10_000
 """Largest number of operators of a model: more would take milliseconds per sample."""
@@ -180,7 +190,10 @@ class Provenance(StrictModel):
 class HysteresisModel(CheckedModel, ABC):
     """Parameters of a model from command to displacement, and of its inverse.
 
+    A mapping is validated by the class of its ``kind``, see :mod:`hilctl.models.kinds`.
+
     Attributes:
+        kind: Registered name of the class.
         input_unit: Unit of the command, ``A`` or ``V``.
         input_range: Lowest and highest command the model was identified on.
         output_range_um: Lowest and highest displacement it was identified on; a reference beyond
@@ -189,11 +202,43 @@ class HysteresisModel(CheckedModel, ABC):
         provenance: Origin of the parameters.
     """
 
+    STANDALONE: ClassVar[bool] = True
+    """Whether a run can use it by itself; otherwise it is part of a staged model."""
+    STAGEABLE: ClassVar[bool] = False
+    """Whether it can be the hysteresis of a staged model."""
+
+    kind: str
     input_unit: CommandUnit = "A"
     input_range: tuple[float, float] | None = None
     output_range_um: tuple[float, float] | None = None
     output_offset_um: float = 0.0
     provenance: Provenance = Field(default_factory=Provenance)
+
+    @classmethod
+    def described_by(cls, data: Any) -> "type[HysteresisModel]":
+        """Return the class of the kind that a mapping names; raise InputError as ``kinds.load``."""
+        if cls is not HysteresisModel:
+            return cls
+        found: type[HysteresisModel] = kinds.load(kinds.MODELS, data["kind"])
+        return found
+
+    @model_validator(mode="wrap")
+    @classmethod
+    def _of_its_kind(cls, data: Any, make: Callable[[Any], Self], info: ValidationInfo) -> Any:
+        if cls is not HysteresisModel or not isinstance(data, Mapping):
+            return make(data)
+        known, kind = kinds.known(kinds.MODELS), data.get("kind")
+        names = ", ".join(map(repr, known))
+        if kind is None:
+            raise ValueError(f"needs a 'kind': {names}")
+        if not isinstance(kind, str) or kind not in known:
+            context = {"discriminator": "'kind'", "tag": str(kind), "expected_tags": names}
+            raise KnownError("union_tag_invalid", context)
+        try:
+            chosen = cls.described_by(data)
+        except InputError as error:
+            raise ValueError(str(error)) from error
+        return chosen.model_validate(data, context=info.context)
 
     @field_validator("input_range", "output_range_um")
     @classmethod
@@ -239,8 +284,13 @@ class HysteresisModel(CheckedModel, ABC):
         return Operator(kernel, parameters, self.operators, input_offset=-offset_um)
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return the parameters as plain mappings, lists and numbers, defaults omitted."""
-        return self.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+        """Return kind and parameters as plain mappings, lists and numbers, defaults omitted."""
+        parameters = self.model_dump(mode="json", exclude_defaults=True, exclude_none=True)
+        return {"kind": self.kind, **parameters}
+
+
+InnerModel: TypeAlias = Annotated[HysteresisModel, PlainSerializer(HysteresisModel.to_mapping)]
+"""A model as a part of another one."""
 
 
 def threshold_problems(name: str, thresholds: Thresholds, *, sign: int = 1) -> Iterator[str]:

@@ -145,6 +145,8 @@ class FieldModel(HysteresisModel):
         activation: Creep of the plays; None for none.
     """
 
+    STANDALONE = False
+    STAGEABLE = True
     kind: Literal["field"] = "field"
     thresholds: Thresholds
     lengths: Thresholds = ()

@@ -38,6 +38,8 @@ class GeneralisedDuhemModel(HysteresisModel):
         losses: Lead of the command.
     """
 
+    STANDALONE = False
+    STAGEABLE = True
     kind: Literal["generalised_duhem"] = "generalised_duhem"
     lowest_um: float
     cell_um: float

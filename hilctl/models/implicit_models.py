@@ -91,6 +91,7 @@ class PreisachModel(ImplicitModel):
             first line, so that the inverse exists.
     """
 
+    STAGEABLE = True
     kind: Literal["preisach"] = "preisach"
     thresholds: Weights
     lowest: float

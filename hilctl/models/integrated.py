@@ -113,6 +113,7 @@ class IntegratedModel(RateDependentPlays):
         deadband: Lambda, from the plays' output to um.
     """
 
+    STAGEABLE = True
     kind: Literal["integrated"] = "integrated"
     deadband: DeadbandFunction
 

@@ -66,7 +66,7 @@ def _facts(
         units = f"displacement in um to command in {unit}"
     yield f"{'Model' if forward else 'Inverse'} of hysteresis: {units}."
     yield ""
-    yield f"model:        {getattr(model, 'kind')}, sha256 {model_sha256(model)}"  # noqa: B009
+    yield f"model:        {model.kind}, sha256 {model_sha256(model)}"
     yield f"sample rate:  {sample_rate_hz:g} Hz; valid for no other rate"
     for name, limits, of in (
         ("displacement", model.output_range_um, "um"),

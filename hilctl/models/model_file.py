@@ -2,21 +2,24 @@
 
 import hashlib
 from pathlib import Path
-from typing import Annotated, TypeAlias
 
 from hilctl.base.files import TextFiles
-from hilctl.base.strict import Field, StrictModel
+from hilctl.base.strict import StrictModel, field_validator
 from hilctl.base.yaml import Document, dump, load_document
 from hilctl.models.base import HysteresisModel
-from hilctl.models.refined import Refinable, RefinedModel
-
-AnyModel: TypeAlias = Annotated[Refinable | RefinedModel, Field(discriminator="kind")]
 
 
 class ModelFile(StrictModel):
     """A model file: one model under the key ``model``."""
 
-    model: AnyModel
+    model: HysteresisModel
+
+    @field_validator("model")
+    @classmethod
+    def _stands_alone(cls, model: HysteresisModel) -> HysteresisModel:
+        if not model.STANDALONE:
+            raise ValueError(f"kind must be one for runs, such as staged around it: {model.kind!r}")
+        return model
 
 
 def load_model(path: Path, files: TextFiles | None = None) -> HysteresisModel:
@@ -31,8 +34,7 @@ def parse_model(name: str, text: str) -> HysteresisModel:
 
 def dump_model(model: HysteresisModel) -> str:
     """Return a model as YAML; reading it back gives the same model, bit for bit."""
-    mapping = {"model": {"kind": getattr(model, "kind"), **model.to_mapping()}}  # noqa: B009
-    return dump(mapping)
+    return dump({"model": model.to_mapping()})
 
 
 def model_sha256(model: HysteresisModel | None) -> str:

@@ -105,6 +105,7 @@ class PlayModel(HysteresisModel):
 class PpiModel(PlayModel):
     """Phi[v] = p_0 v + sum p_i F_i[v], rate-independent and symmetric (3.6)."""
 
+    STAGEABLE = True
     kind: Literal["ppi"] = "ppi"
 
 
@@ -129,6 +130,7 @@ class RateDependentPlays(PlayModel):
 class RdpiModel(RateDependentPlays):
     """Pi[v] = a_0 v + sum a_i Gamma_i[v], thresholds r_i + gamma |v'| (5.5, 6.18)."""
 
+    STAGEABLE = True
     kind: Literal["rdpi"] = "rdpi"
 
 

@@ -1,38 +1,22 @@
 """A model with its identified residual, and the inverse of both: read from files of 0.2.0."""
 
 from collections.abc import Callable, Iterator
-from typing import Annotated, Any, Literal, Self, TypeAlias
+from typing import Literal, Self
 
 import numpy as np
 
 from hilctl.base.strict import CheckedModel, Field
 from hilctl.kernels.residual_operator import Tables, residual_forward, residual_inverse
-from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights, threshold_problems
-from hilctl.models.implicit_models import (
-    BoucWenModel,
-    DuhemModel,
-    KrasnoselskiiPokrovskiiModel,
-    PreisachModel,
+from hilctl.models.base import (
+    HysteresisModel,
+    InnerModel,
+    Operator,
+    Thresholds,
+    Weights,
+    threshold_problems,
 )
-from hilctl.models.integrated import ButterflyModel, IntegratedModel
 from hilctl.models.linear_stages import Chain, FirstMode
-from hilctl.models.plays import GeneralisedModel, PpiModel, RdpiModel, SpiModel
 from hilctl.models.staged import StagedModel
-
-Refinable: TypeAlias = (
-    PpiModel
-    | SpiModel
-    | RdpiModel
-    | IntegratedModel
-    | StagedModel
-    | ButterflyModel
-    | GeneralisedModel
-    | PreisachModel
-    | KrasnoselskiiPokrovskiiModel
-    | BoucWenModel
-    | DuhemModel
-)
-"""Every kind of model except the refined one."""
 
 
 class ResidualOperator(CheckedModel):
@@ -127,10 +111,12 @@ class RefinedModel(HysteresisModel):
     """
 
     kind: Literal["refined"] = "refined"
-    base: Annotated[Refinable, Field(discriminator="kind")]
+    base: InnerModel
     residual: ResidualOperator
 
     def _problems(self) -> Iterator[str]:
+        if not self.base.STANDALONE or isinstance(self.base, RefinedModel):
+            yield f"base.kind must be one for runs, and not refined: {self.base.kind!r}"
         if self.base.input_unit != self.input_unit:
             yield f"base.input_unit must be {self.input_unit}, as outside"
 
@@ -166,7 +152,3 @@ class RefinedModel(HysteresisModel):
         """Return the model with the inverse of its base as of 0.2.0."""
         base = self.base.earlier()
         return None if base is None else self.model_copy(update={"base": base})
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the parameters as plain mappings, lists and numbers, defaults omitted."""
-        return super().to_mapping() | {"base": {"kind": self.base.kind, **self.base.to_mapping()}}

@@ -15,17 +15,13 @@ that of further modes is exact.
 
 import math
 from collections.abc import Iterator
-from typing import Annotated, Any, Literal, Self, TypeVar
+from typing import Any, Literal, Self, TypeVar
 
 import numpy as np
 
 from hilctl.base.strict import Field, PrivateAttr, StrictModel
 from hilctl.kernels.dynamics import lag_block, lead_block, weigh_block
-from hilctl.models.base import HysteresisModel, Operator, Provenance
-from hilctl.models.effective_field import FieldModel
-from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.implicit_models import PreisachModel
-from hilctl.models.integrated import IntegratedModel
+from hilctl.models.base import HysteresisModel, InnerModel, Operator, Provenance
 from hilctl.models.linear_stages import (
     Chain,
     CreepModel,
@@ -35,12 +31,7 @@ from hilctl.models.linear_stages import (
     delayed,
     smoothing_weights,
 )
-from hilctl.models.plays import PpiModel, RdpiModel
 
-AnyHysteresis = Annotated[
-    PpiModel | RdpiModel | IntegratedModel | PreisachModel | FieldModel | GeneralisedDuhemModel,
-    Field(discriminator="kind"),
-]
 Model = TypeVar("Model", bound=HysteresisModel)
 _WHOLE = 1e-6
 
@@ -93,7 +84,7 @@ class StagedModel(HysteresisModel):
     """
 
     kind: Literal["staged"] = "staged"
-    hysteresis: AnyHysteresis
+    hysteresis: InnerModel
     lag: FieldLag | None = None
     structure: FirstMode | None = None
     modes: tuple[FurtherMode, ...] = Field(default=(), max_length=8)
@@ -103,12 +94,14 @@ class StagedModel(HysteresisModel):
     _excites_structure: bool = PrivateAttr(default=False)
 
     @classmethod
-    def around(cls, hysteresis: AnyHysteresis, **stages: Any) -> Self:
+    def around(cls, hysteresis: HysteresisModel, **stages: Any) -> Self:
         """Return a hysteresis model between stages, with its unit, ranges and provenance."""
         inner, shared = split_frame(hysteresis)
         return cls(hysteresis=inner, **stages, **shared)
 
     def _problems(self) -> Iterator[str]:
+        if not self.hysteresis.STAGEABLE:
+            yield f"hysteresis.kind must be one that takes stages: {self.hysteresis.kind!r}"
         for name in ("input_range", "output_range_um"):
             if getattr(self.hysteresis, name) is not None:
                 yield f"hysteresis.{name} must be set beside hysteresis instead"
@@ -194,9 +187,3 @@ class StagedModel(HysteresisModel):
         whole = math.floor(samples + _WHOLE)
         part = samples - whole
         return whole, part if part > _WHOLE else 0.0
-
-    def to_mapping(self) -> dict[str, Any]:
-        """Return the parameters as plain mappings, lists and numbers, defaults omitted."""
-        mapping = super().to_mapping()
-        kind = self.hysteresis.kind
-        return mapping | {"hysteresis": {"kind": kind, **self.hysteresis.to_mapping()}}

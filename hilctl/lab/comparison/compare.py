@@ -114,7 +114,7 @@ def _row_mapping(loops: Sequence[SteadyLoop], row: ComparedModel) -> dict[str, A
         "compensated_peak_percent": row.compensated_percent,
         "loops": [{"frequency_hz": loop.frequency_hz, **asdict(error)} for loop, error in errors],
         "compensated": [asdict(trial) for trial in row.trials],
-        "model": {"kind": getattr(row.model, "kind"), **row.model.to_mapping()},  # noqa: B009
+        "model": row.model.to_mapping(),
     }
 
 

@@ -291,7 +291,7 @@ class FittedModel(Evaluation, FoundModel):
     def to_mapping(self) -> dict[str, Any]:
         """Return all fields as plain mappings, lists and numbers, for JSON."""
         return {
-            "model": {"kind": getattr(self.model, "kind"), **self.model.to_mapping()},  # noqa: B009
+            "model": self.model.to_mapping(),
             **Evaluation.to_mapping(self),
             "starts": [asdict(start) for start in self.starts],
             "numbers": self.numbers,

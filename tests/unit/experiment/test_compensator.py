@@ -71,6 +71,8 @@ def test_a_start_that_would_trip_on_the_tracking_error_is_refused(monkeypatch):
 class Offset(HysteresisModel):
     """Commands are 3 A above the reference, and rest comes slowly: a um more with each sample."""
 
+    kind: str = "offset"
+
     @property
     def operators(self):
         """Return 1: a number that is added to the commands."""

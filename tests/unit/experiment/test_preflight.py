@@ -52,6 +52,7 @@ class BrokenModel(HysteresisModel):
     """A model whose inverse gives 0 A, and something that is not finite at one sample."""
 
     model_config = ConfigDict(allow_inf_nan=True)
+    kind: str = "broken"
     bad: float
     at: int
 

@@ -3,16 +3,15 @@
 import shutil
 import subprocess
 from pathlib import Path
-from typing import get_args
 
 import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
+from hilctl.models import kinds
 from hilctl.models.model_export import export_text
-from hilctl.models.model_file import AnyModel
 from hilctl.models.plays import GeneralisedModel, PlayEnvelope, SpiModel
-from hilctl.models.staged import AnyHysteresis, StagedModel
+from hilctl.models.staged import StagedModel
 from tests.published import piezo_ppi, terfenol_rdpi
 from tests.unit.models.test_effective_field import ACTIVATION, field_model
 from tests.unit.models.test_generalised_duhem import duhem_model
@@ -47,17 +46,8 @@ FORMS["linear lag"] = StagedModel.around(OMEGA, **STAGES["linear lag"])
 FORMS["exponent 2"] = BOUC_WEN.model_copy(update={"exponent": 2})
 
 
-def kinds_of(union):
-    """Return the kinds of all models of a union."""
-    return {
-        each.model_fields["kind"].default
-        for part in get_args(get_args(union)[0])
-        for each in (get_args(part) or (part,))
-    }
-
-
 def test_every_kind_is_covered():
-    assert kinds_of(AnyModel) | kinds_of(AnyHysteresis) <= FORMS.keys()
+    assert kinds.known(kinds.MODELS).keys() <= FORMS.keys()
 
 
 def signal(forward, samples):

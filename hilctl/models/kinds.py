@@ -1,0 +1,60 @@
+"""Kinds of model by name: the classes of model files, and the fits of ``hilctl identify --model``.
+
+A kind is registered as text, so a run imports the module of its own model only, and no fit. One fit
+may give a model of another name. A package adds a kind with::
+
+    [project.entry-points."hilctl.models"]
+    my_kind = "my_package.model:MyModel"
+
+    [project.entry-points."hilctl.fits"]
+    my_kind = "my_package.fit:MY_FIT"
+"""
+
+from collections.abc import Mapping
+from pkgutil import resolve_name
+from typing import Any
+
+from hilctl.base.errors import InputError
+from hilctl.base.formatting import did_you_mean
+from hilctl.base.plugins import registered
+
+MODELS = "hilctl.models"
+"""Group of subclasses of :class:`hilctl.models.base.HysteresisModel`, by their ``kind``."""
+FITS = "hilctl.fits"
+"""Group of :class:`hilctl.lab.identify.fit_api.Fit`, which the laboratory loads."""
+BUILTIN: Mapping[str, Mapping[str, str]] = {
+    MODELS: {
+        "ppi": "hilctl.models.plays:PpiModel",
+        "spi": "hilctl.models.plays:SpiModel",
+        "rdpi": "hilctl.models.plays:RdpiModel",
+        "integrated": "hilctl.models.integrated:IntegratedModel",
+        "staged": "hilctl.models.staged:StagedModel",
+        "butterfly": "hilctl.models.integrated:ButterflyModel",
+        "generalised": "hilctl.models.plays:GeneralisedModel",
+        "preisach": "hilctl.models.implicit_models:PreisachModel",
+        "krasnoselskii_pokrovskii": "hilctl.models.implicit_models:KrasnoselskiiPokrovskiiModel",
+        "bouc_wen": "hilctl.models.implicit_models:BoucWenModel",
+        "duhem": "hilctl.models.implicit_models:DuhemModel",
+        "field": "hilctl.models.effective_field:FieldModel",
+        "generalised_duhem": "hilctl.models.generalised_duhem:GeneralisedDuhemModel",
+        "refined": "hilctl.models.refined:RefinedModel",
+    },
+}
+
+
+def known(group: str) -> dict[str, str]:
+    """Return the names of a group, each with its ``module:object``; hilctl's own first."""
+    others = {name: point.value for name, point in registered(group).items()}
+    return {**BUILTIN[group], **others, **BUILTIN[group]}
+
+
+def load(group: str, name: str) -> Any:
+    """Return a registered object; raise InputError if it is unknown or cannot be loaded."""
+    place = BUILTIN[group].get(name) or known(group).get(name)
+    if place is None:
+        raise InputError(f"unknown kind of model '{name}' ({did_you_mean(name, known(group))})")
+    try:
+        return resolve_name(place)
+    except Exception as error:
+        text = f"{type(error).__name__}: {error}"
+        raise InputError(f"cannot load the kind of model '{name}' ({place}): {text}") from error
