@@ -21,14 +21,13 @@ from hilctl.lab.identify.least_squares import (
     numbered,
     smooth_densities,
 )
-from hilctl.models.implicit_models import (
-    NOTHING,
-    BoucWenModel,
-    DuhemModel,
-    KrasnoselskiiPokrovskiiModel,
-    PreisachModel,
-)
-from hilctl.models.plays import GeneralisedModel, PlayEnvelope, PpiModel
+from hilctl.models.bouc_wen import BoucWenModel
+from hilctl.models.duhem import DuhemModel
+from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
+from hilctl.models.implicit_models import NOTHING
+from hilctl.models.krasnoselskii import KrasnoselskiiPokrovskiiModel
+from hilctl.models.plays import PpiModel
+from hilctl.models.preisach import PreisachModel
 
 SMOOTHNESS = 0.01  # increases no error, but makes the solution unique
 

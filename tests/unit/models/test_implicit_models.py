@@ -10,15 +10,13 @@ from hypothesis.extra import numpy as hnp
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
-from hilctl.models.implicit_models import (
-    TOLERANCE_UM,
-    BoucWenModel,
-    DuhemModel,
-    KrasnoselskiiPokrovskiiModel,
-    PreisachModel,
-)
+from hilctl.models.bouc_wen import BoucWenModel
+from hilctl.models.duhem import DuhemModel
+from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
+from hilctl.models.implicit_models import TOLERANCE_UM
+from hilctl.models.krasnoselskii import KrasnoselskiiPokrovskiiModel
 from hilctl.models.model_file import dump_model, parse_model
-from hilctl.models.plays import GeneralisedModel, PlayEnvelope
+from hilctl.models.preisach import PreisachModel
 
 RATE_HZ = 50_000.0
 LOW, HIGH = SPAN = (-7.0, 8.0)

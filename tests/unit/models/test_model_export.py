@@ -9,8 +9,9 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.models import kinds
+from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
 from hilctl.models.model_export import export_text
-from hilctl.models.plays import GeneralisedModel, PlayEnvelope, SpiModel
+from hilctl.models.plays import SpiModel
 from hilctl.models.staged import StagedModel
 from tests.published import piezo_ppi, terfenol_rdpi
 from tests.unit.models.test_effective_field import ACTIVATION, field_model

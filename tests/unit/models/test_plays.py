@@ -6,9 +6,10 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import ConfigError, ModelError
 from hilctl.models.base import HysteresisModel
+from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
 from hilctl.models.model_file import parse_model
-from hilctl.models.plays import GeneralisedModel, PlayEnvelope, PpiModel, RdpiModel, SpiModel
+from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 from tests.published import piezo_ppi
 
 GOOD = {"direct": 1.0, "weights": (0.5, 0.0, 0.2), "thresholds": (0.1, 0.2, 0.5)}

@@ -13,7 +13,8 @@ from hilctl.base.types import F64
 from hilctl.lab.identify.data.records import SteadyLoop
 from hilctl.lab.identify.fit_api import FitJob, FoundModel
 from hilctl.lab.identify.least_squares import first_least
-from hilctl.models.integrated import ButterflyModel, DeadbandFunction
+from hilctl.models.butterfly import ButterflyModel
+from hilctl.models.integrated import DeadbandFunction
 
 _CORNERS = 16  # slopes of the even function
 _NEAR = 0.1  # of the stroke: distance to the turning point for a change of wing

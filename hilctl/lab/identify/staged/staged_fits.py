@@ -34,6 +34,7 @@ from hilctl.lab.identify.staged.objective import (
     staged_model,
 )
 from hilctl.models.integrated import IntegratedModel
+from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import StagedModel
 
 KNOTS = 16  # of Lambda^-1

@@ -17,14 +17,13 @@ from hilctl.lab.identify.literature import (
 )
 from hilctl.lab.identify.settings import FitSettings
 from hilctl.lab.identify.staged.staged_fits import fit_free
-from hilctl.models.implicit_models import (
-    BoucWenModel,
-    DuhemModel,
-    KrasnoselskiiPokrovskiiModel,
-    PreisachModel,
-)
+from hilctl.models.bouc_wen import BoucWenModel
+from hilctl.models.duhem import DuhemModel
+from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
-from hilctl.models.plays import GeneralisedModel, PlayEnvelope, PpiModel
+from hilctl.models.krasnoselskii import KrasnoselskiiPokrovskiiModel
+from hilctl.models.plays import PpiModel
+from hilctl.models.preisach import PreisachModel
 from tests.published import piezo_ppi
 
 RNG = np.random.default_rng(4)
