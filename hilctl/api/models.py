@@ -263,7 +263,7 @@ def compare(
     if html is not None:
         check_writable(Path(html), overwrite=overwrite, inputs=inputs)
     if save is not None:
-        kinds = models or list(library.COMPARED)
+        kinds = models or library.compared_kinds()
         library.check_free(kinds, Path(save), overwrite=overwrite, inputs=inputs)
     finish_dead_runs()
     comparison = library.compare(

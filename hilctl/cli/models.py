@@ -23,7 +23,7 @@ from hilctl.cli.output import print_result
 from hilctl.lab.comparison.compare import Comparison, headings, notes, table_rows
 from hilctl.lab.identify.pipeline import Identification
 from hilctl.lab.identify.refinement import Refinement
-from hilctl.lab.identify.registry import CATALOGUE
+from hilctl.lab.identify.registry import all_fits
 from hilctl.lab.identify.settings import setting_rows
 from hilctl.lab.identify.summary import (
     change_tables,
@@ -37,7 +37,7 @@ from hilctl.run.control.client import finish_dead_runs
 
 def _kinds() -> list[tuple[str, str]]:
     """Return kinds of model, for completion."""
-    return [(kind, each.title) for kind, each in CATALOGUE.items()]
+    return [(kind, each.title) for kind, each in all_fits().items()]
 
 
 def _setting_keys() -> list[tuple[str, str]]:
@@ -112,7 +112,7 @@ Frequencies = Annotated[
 def _list_settings(requested: bool) -> None:
     if not requested:
         return
-    kinds = [(kind, each.title, each.found_by, each.data) for kind, each in CATALOGUE.items()]
+    kinds = [(kind, each.title, each.found_by, each.data) for kind, each in all_fits().items()]
     print_rich(listing("", [("--model", "description", "identified by", "from"), *kinds]))
     headings = ("--set", "default", "limits", "of", "description")
     print_rich("", listing("", [headings, *setting_rows()]))

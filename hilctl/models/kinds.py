@@ -21,7 +21,7 @@ from hilctl.base.plugins import registered
 MODELS = "hilctl.models"
 """Group of subclasses of :class:`hilctl.models.base.HysteresisModel`, by their ``kind``."""
 FITS = "hilctl.fits"
-"""Group of :class:`hilctl.lab.identify.fit_api.Fit`, which the laboratory loads."""
+"""Group of :class:`hilctl.lab.identify.registry.Fit`, which the laboratory loads."""
 BUILTIN: Mapping[str, Mapping[str, str]] = {
     MODELS: {
         "ppi": "hilctl.models.plays:PpiModel",
@@ -38,6 +38,23 @@ BUILTIN: Mapping[str, Mapping[str, str]] = {
         "field": "hilctl.models.effective_field:FieldModel",
         "generalised_duhem": "hilctl.models.generalised_duhem:GeneralisedDuhemModel",
         "refined": "hilctl.models.refined:RefinedModel",
+    },
+    FITS: {
+        "integrated": "hilctl.lab.identify.staged.staged_fits:INTEGRATED",
+        "staged": "hilctl.lab.identify.staged.staged_fits:STAGED",
+        "rdpi": "hilctl.lab.identify.searched.plays:RDPI",
+        "asymmetric": "hilctl.lab.identify.staged.staged_fits:ASYMMETRIC",
+        "ppi": "hilctl.lab.identify.searched.plays:PPI",
+        "spi": "hilctl.lab.identify.searched.plays:SPI",
+        "generalised": "hilctl.lab.identify.literature.generalised_plays:GENERALISED",
+        "preisach": "hilctl.lab.identify.literature.preisach:PREISACH",
+        "kp": "hilctl.lab.identify.literature.krasnoselskii:KP",
+        "bouc_wen": "hilctl.lab.identify.literature.bouc_wen:BOUC_WEN",
+        "duhem": "hilctl.lab.identify.literature.duhem:DUHEM",
+        "butterfly": "hilctl.lab.identify.literature.butterfly:BUTTERFLY",
+        "field": "hilctl.lab.identify.field.field_search:FIELD",
+        "generalised_duhem": "hilctl.lab.identify.field.duhem_search:GENERALISED_DUHEM",
+        "straight": "hilctl.lab.identify.literature.straight:STRAIGHT",
     },
 }
 

@@ -15,7 +15,7 @@ from hilctl.lab.identify.data.records import SteadyLoop
 from hilctl.lab.identify.evaluation import judge
 from hilctl.lab.identify.fit_api import FitRequest
 from hilctl.lab.identify.fit_model import FittedModel, fit_model
-from hilctl.lab.identify.settings import FitKind, FitSettings
+from hilctl.lab.identify.settings import FitSettings
 from hilctl.signals.cycle_metrics import fold, peak_hysteresis_percent
 from hilctl_drivers.simulated.terfenol import TerfenolParameters
 from tests.rig import RATE_HZ, driven, steady_loop
@@ -29,7 +29,7 @@ def sines(
     return [measured_loop((a, f), points=points) for a in amplitudes for f in frequencies]
 
 
-def fit(kind: FitKind, data: list[SteadyLoop], **choices: Any) -> FittedModel:
+def fit(kind: str, data: list[SteadyLoop], **choices: Any) -> FittedModel:
     return fit_model(FitRequest(data, FitSettings(kind=kind, **choices)))
 
 

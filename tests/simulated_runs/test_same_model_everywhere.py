@@ -19,14 +19,14 @@ from hilctl.base.types import F64
 from hilctl.lab.identify.data.records import History
 from hilctl.lab.identify.fit_api import FitRequest
 from hilctl.lab.identify.fit_model import fit_model
-from hilctl.lab.identify.registry import CATALOGUE, HISTORIES
+from hilctl.lab.identify.registry import HISTORIES, all_fits, fit_named
 from hilctl.lab.identify.settings import FitSettings
 from tests.commands import ended
 from tests.rig import RATE_HZ, driven, steady_loop
 
 TONES = [(a, f) for a in (3.0, 7.0) for f in (10.0, 100.0, 200.0)]
 FITS: dict[str, dict[str, Any]] = {
-    **{kind: {"kind": kind} for kind in CATALOGUE if kind != "field"},
+    **{kind: {"kind": kind} for kind in all_fits() if kind != "field"},
     "generalised_duhem": {"kind": "generalised_duhem", "cells": 12, "across": 8},
     "rdpi, exponential": {"kind": "rdpi", "weights": "exponential", "weight_by": "equal"},
     "integrated, free": {"kind": "integrated", "weights": "free"},
@@ -69,7 +69,7 @@ def fit_all() -> None:
     loops, whole = [steady_loop(tone, points=64, cycles=5) for tone in TONES], [history()]
     models = {}
     for name, choices in FITS.items():
-        records = whole if CATALOGUE[choices["kind"]].data == HISTORIES else loops
+        records = whole if fit_named(choices["kind"]).data == HISTORIES else loops
         fit = fit_model(FitRequest(records, FitSettings(**choices)))
         models[name] = fit.model.model_dump(mode="json", exclude={"provenance"})
     print(json.dumps(models))

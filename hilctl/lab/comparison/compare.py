@@ -1,7 +1,7 @@
 """Compare models: identify and evaluate them on the same loops, try them on the same device."""
 
 import time
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
@@ -24,8 +24,8 @@ from hilctl.lab.identify.evaluation import Evaluation, judge
 from hilctl.lab.identify.fit_api import FitRequest, OnProgress, ignore_progress
 from hilctl.lab.identify.fit_data import FitData
 from hilctl.lab.identify.fit_model import FittedModel, fit_model
-from hilctl.lab.identify.registry import entry
-from hilctl.lab.identify.settings import FitKind, FitSettings
+from hilctl.lab.identify.registry import all_fits, fit_named
+from hilctl.lab.identify.settings import FitSettings
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import dump_model, load_model
 from hilctl.recording.reader import read
@@ -34,26 +34,10 @@ from hilctl.recording.recording import Recording
 POINTS = 300
 _FILES = (".yaml", ".yml")
 
-# The simpler models get free weights and an offset, unlike the published Omega, so that their error
-# is not due to a lack of parameters.
-_FREE: Mapping[str, Any] = {"plays": 12, "weights": "free", "weight_by": "equal", "offset": True}
-_FEW: Mapping[str, Any] = {"plays": 12}
 
-COMPARED: Mapping[FitKind, Mapping[str, Any]] = {
-    "integrated": {"starts": 3},
-    "staged": {},
-    "rdpi": _FREE,
-    "asymmetric": _FEW,
-    "ppi": _FREE,
-    "generalised": _FEW,
-    "preisach": {},
-    "kp": {},
-    "bouc_wen": {},
-    "duhem": {},
-    "straight": {},
-}
-"""Default kinds, the reference first, with comparable settings. Without spi, which has the loops of
-ppi, and butterfly, which is for rods without a bias."""
+def compared_kinds() -> tuple[str, ...]:
+    """Return the kinds that are compared by default, the reference first."""
+    return tuple(name for name, fit in all_fits().items() if fit.compared is not None)
 
 
 @dataclass(frozen=True, slots=True)
@@ -120,7 +104,7 @@ def _row_mapping(loops: Sequence[SteadyLoop], row: ComparedModel) -> dict[str, A
 
 def compare(
     recordings: Sequence[Path],
-    models: Sequence[str] = (),  # empty for COMPARED
+    models: Sequence[str] = (),  # empty for compared_kinds()
     *,
     experiment: Path | None = None,
     settings: Sequence[str] = (),
@@ -135,10 +119,10 @@ def compare(
     over nearly the complete stroke. Without frequencies, a waveform other than sine and triangle
     is unchanged. The clock returns the time in s.
     """
-    names = tuple(models) or tuple(COMPARED)
+    names = tuple(models) or compared_kinds()
     for name in names:
         if not name.endswith(_FILES):
-            entry(name)
+            fit_named(name)
     recorded = [read(path) for path in recordings]
     units = {recording.command_unit for recording in recorded}
     if len(units) != 1:
@@ -175,8 +159,8 @@ def _row(
         if model.input_unit != data.unit:
             raise InputError(f"{name}: must take commands in {data.unit}, as the loops do")
     else:
-        kind, known = entry(name)
-        settings = FitSettings(kind=kind, **COMPARED.get(kind, {}))
+        known = fit_named(name)
+        settings = FitSettings(kind=name, **(known.compared or {}))
         found = fit_model(FitRequest(data.records, settings, unit=data.unit, source=sources))
         model, title = found.model, known.title
     elapsed_s = clock() - begin

@@ -1,7 +1,7 @@
 """Models from measured data.
 
-``pipeline`` turns records into an evaluated model. ``registry`` lists all kinds of model,
-``settings`` their settings, ``fit_api`` the types of a fit, ``fit_data`` its prepared records.
+``pipeline`` turns records into an evaluated model. ``registry`` finds the fit of a kind of model,
+``settings`` has their settings, ``fit_api`` the types of a fit, ``fit_data`` its prepared records.
 ``refinement`` compares a model of runs with the one that they used.
 
 data        loops and histories from recordings and tables

@@ -30,7 +30,6 @@ from hilctl.lab.identify.data.records import (
 from hilctl.lab.identify.evaluation import Evaluation, judge
 from hilctl.lab.identify.fit_api import FitJob, FitRequest, FoundModel
 from hilctl.lab.identify.fit_data import FitData
-from hilctl.lab.identify.registry import CATALOGUE
 from hilctl.lab.identify.resonances import without_modes
 from hilctl.models.base import IdentifiedRange, Provenance
 from hilctl.models.linear_stages import CreepModel
@@ -191,10 +190,6 @@ class _LeastSquares:
         return means - self._others @ (self._others.T @ means)
 
 
-EVERY_SAMPLE = {"staged", "field", "generalised_duhem"}
-"""Kinds with a lag: for the others, long records are thinned."""
-
-
 def fit_kind(request: FitRequest) -> FoundModel:
     """Fit a kind of model to records without creep and known modes, which become its parts."""
     records, settings, unit = request.records, request.settings, request.unit
@@ -203,11 +198,11 @@ def fit_kind(request: FitRequest) -> FoundModel:
     creep = creep_of(records) if linear else None
     bare = records if creep is None else without_creep(records, creep)
     bare = without_modes(bare, modes) if modes else bare
-    data = FitData(bare if settings.kind in EVERY_SAMPLE else thinned(bare), unit)
+    data = FitData(bare if settings.fit.has_lag else thinned(bare), unit)
     structure = settings.looks_for("structure") and (request.structure or True)
     job = FitJob(data, settings, request.run, request.progress, request.start, structure)
     try:
-        found = CATALOGUE[settings.kind].fit(job)
+        found = settings.fit.fit(job)
     except ValidationError as error:
         rule = f"the best fit of --model {settings.kind} is no valid model"
         cure = "choose another kind, or remove faulty samples (steps, spikes, drift) from the data"
@@ -318,7 +313,7 @@ def fit_model(request: FitRequest) -> FittedModel:
     judged = judge(found.model, data, creep=settings.creep)
     provenance = Provenance(
         source=tuple(request.source),
-        method="; ".join(filter(None, (CATALOGUE[settings.kind].title, settings.changes()))),
+        method="; ".join(filter(None, (settings.fit.title, settings.changes()))),
         grid=tuple(map(_grid_line, request.records)),
         parameters=found.parameters,
         errors_percent=error_table(judged),

@@ -76,7 +76,7 @@ def verdict_of(
     verdict = partial(
         Verdict, within_percent=within, held_out=held_out is not None, classes=classes
     )
-    if reasons := tuple(data_reasons(records, even=settings.kind == "butterfly")):
+    if reasons := tuple(data_reasons(records, even=settings.fit.is_even)):
         return verdict("not a model", reasons=reasons)
     reasons = tuple(_fit_reasons(fit, records, settings, held_out))
     suggestions = _suggestions(fit, records, settings)

@@ -20,7 +20,7 @@ from hilctl.lab.identify.model_selection import (
     held_out_error,
     select,
 )
-from hilctl.lab.identify.registry import entry
+from hilctl.lab.identify.registry import fit_named
 from hilctl.lab.identify.resonances import WORTH, further_modes
 from hilctl.lab.identify.settings import IdentifySettings
 from hilctl.models.linear_stages import FirstMode, FurtherMode
@@ -104,8 +104,8 @@ def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
     if kind == "auto":
         document = Document("hilctl identify", "kind: field\nauto: true")
     else:
-        known, _ = entry(kind)
-        document = Document("hilctl identify", f"kind: {known}")
+        fit_named(kind)
+        document = Document("hilctl identify", f"kind: {kind}")
     for text in texts:
         document.set(text)
     return document.validate(IdentifySettings)

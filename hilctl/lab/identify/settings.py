@@ -1,50 +1,30 @@
-"""Settings of a fit, each with its default, limits and kinds of model.
+"""Settings of a fit, each with its default and limits; a kind of model takes some of them.
 
-A new setting is a field of :class:`FitSettings`. The command line, the list of ``hilctl identify
---settings`` and the provenance in a model file follow from the fields.
+A new setting is a field of :class:`FitSettings`, named by each :class:`Fit` that takes it. The
+command line, the list of ``hilctl identify --settings`` and the provenance in a model file follow
+from the fields.
 """
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator, Mapping, Sequence
 from typing import Any, ClassVar, Literal, TypeAlias, get_args, get_origin
 
 from pydantic import Field, ValidationInfo, field_validator, model_validator
 from pydantic.fields import FieldInfo
 
+from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
 from hilctl.base.types import CommandUnit
+from hilctl.lab.identify.registry import Fit, all_fits, fit_named
+from hilctl.models.kinds import FITS, known
 
-FitKind: TypeAlias = Literal[
-    "integrated", "staged", "rdpi", "asymmetric", "ppi", "spi", "generalised", "preisach", "kp",
-    "bouc_wen", "duhem", "butterfly", "straight", "field",
-    "generalised_duhem",
-]  # fmt: skip
 Choices: TypeAlias = Mapping[str, Any]
-
-_PLAIN = ("ppi", "spi", "rdpi")
-_SEARCHED = (*_PLAIN, "integrated")
-_PLAYS = (*_SEARCHED, "staged", "asymmetric")
-_TABLES = ("field", "generalised_duhem")
-
-_HISTORIES = {"field", "generalised_duhem", "ppi", "spi"}
-
-_PPI: Choices = {"plays": 10}
-PUBLISHED: Mapping[str, Choices] = {
-    "ppi": _PPI,
-    "spi": _PPI,
-    "rdpi": {"plays": 4, "weights": "free", "weight_by": "hysteresis", "points": 400},
-    # Nothing is published for staged models: these met the published figures on the simulated rig.
-    "staged": {"plays": 20, "deadbands": 12, "offset": True, "starts": 4},
-    "asymmetric": {"offset": True},
-    "butterfly": {"plays": 16},
-    "field": {"plays": 32, "cells": 12},
-}
-"""Defaults of single kinds; sections 3.4.2 (PPI), 5.3 (RDPI), 6.4."""
+NO_CHOICES: Choices = {}
+_COMMON = {"kind", "points", "own"}
+"""Settings of all kinds of model."""
 
 
-def _of(kinds: tuple[str, ...], default: Any, description: str, **limits: Any) -> Any:
-    """Return a field of these kinds of model; of all kinds if none is named."""
-    extra: dict[str, Any] = {"kinds": list(kinds)}
-    return Field(default, description=description, json_schema_extra=extra, **limits)
+def _setting(default: Any, description: str, **limits: Any) -> Any:
+    return Field(default, description=description, **limits)
 
 
 class FitSettings(StrictModel):
@@ -58,85 +38,85 @@ class FitSettings(StrictModel):
         "delay": "removed: --model staged fits a delay, which may be 0",
     }
 
-    kind: FitKind = Field("integrated", description="Kind of model.")
-    plays: int = _of(
-        (*_PLAYS, "generalised", "butterfly", "field"),
-        12,
-        "Play operators n.",
-        ge=1,
-        le=200,
+    kind: str = _setting("integrated", "Kind of model.")
+    plays: int = _setting(12, "Play operators n.", ge=1, le=200)
+    deadbands: int = _setting(
+        8, "Deadband operators k on each side of 0, 2 k + 1 in all.", ge=1, le=100
     )
-    deadbands: int = _of(
-        ("integrated", "staged", "asymmetric"),
-        8,
-        "Deadband operators k on each side of 0, 2 k + 1 in all.",
-        ge=1,
-        le=100,
+    lines: int = _setting(
+        16, "Lines of a Preisach triangle, and cells of the longest line.", ge=2, le=100
     )
-    lines: int = _of(
-        ("preisach",),
-        16,
-        "Lines of a Preisach triangle, and cells of the longest line.",
-        ge=2,
-        le=100,
+    cells: int = _setting(
+        28, "Pieces of each table, along the effective field or the displacement.", ge=3, le=60
     )
-    cells: int = _of(
-        _TABLES,
-        28,
-        "Pieces of each table, along the effective field or the displacement.",
-        ge=3,
-        le=60,
+    across: int = _setting(20, "Cells of a table of slopes across its band.", ge=2, le=60)
+    activation: bool = _setting(False, "Plays creep with the logarithm of time.")
+    knots: int = _setting(24, "Pieces of the output curve.", ge=2, le=60)
+    weights: Literal["exponential", "free"] = _setting(
+        "exponential", "Weights a e^(-b i) (3.26, 6.19-6.23), or each weight by itself."
     )
-    across: int = _of(
-        ("generalised_duhem",), 20, "Cells of a table of slopes across its band.", ge=2, le=60
+    layout: Literal["even", "midpoint"] = _setting(
+        "even", "Thresholds alpha i (3.25, 6.18), or alpha (i - 1/2)."
     )
-    activation: bool = _of(("field",), False, "Plays creep with the logarithm of time.")
-    knots: int = _of(("field",), 24, "Pieces of the output curve.", ge=2, le=60)
-    weights: Literal["exponential", "free"] = _of(
-        _SEARCHED, "exponential", "Weights a e^(-b i) (3.26, 6.19-6.23), or each weight by itself."
+    weight_by: Literal["equal", "hysteresis"] = _setting(
+        "equal", "Weight of a loop: 1 (6.24), or its peak hysteresis (5.14)."
     )
-    layout: Literal["even", "midpoint"] = _of(
-        _PLAIN, "even", "Thresholds alpha i (3.25, 6.18), or alpha (i - 1/2)."
+    offset: bool = _setting(False, "Fit a constant displacement; published models have none.")
+    creep: bool = _setting(False, "Fit an offset and creep, c + d ln(1 + t / 0.1 s), per record.")
+    creep_stage: bool = _setting(True, "Fit creep if histories rest for 0.5 s or longer.")
+    modes: bool = _setting(True, "Fit further modes of the structure to histories.")
+    structure: bool = _setting(True, "Fit a second-order structure.")
+    turning_um: float | None = _setting(
+        None, "Displacement where the wings meet; the lowest one if not set."
     )
-    weight_by: Literal["equal", "hysteresis"] = _of(
-        _PLAYS, "equal", "Weight of a loop: 1 (6.24), or its peak hysteresis (5.14)."
-    )
-    offset: bool = _of(_PLAYS, False, "Fit a constant displacement; published models have none.")
-    creep: bool = _of(
-        _PLAIN, False, "Fit an offset and creep, c + d ln(1 + t / 0.1 s), per record."
-    )
-    creep_stage: bool = _of(_TABLES, True, "Fit creep if histories rest for 0.5 s or longer.")
-    modes: bool = _of(_TABLES, True, "Fit further modes of the structure to histories.")
-    structure: bool = _of(_TABLES, True, "Fit a second-order structure.")
-    turning_um: float | None = _of(
-        ("butterfly",), None, "Displacement where the wings meet; the lowest one if not set."
-    )
-    magnets: bool = _of(("butterfly",), True, "Fit a bias field at zero command.")
-    starts: int = _of(_PLAYS, 6, "Starting points of the search.", ge=1, le=1000)
-    points: int = _of((), 300, "Points per loop.", ge=16, le=100_000)
+    magnets: bool = _setting(True, "Fit a bias field at zero command.")
+    starts: int = _setting(6, "Starting points of the search.", ge=1, le=1000)
+    points: int = _setting(300, "Points per loop.", ge=16, le=100_000)
+    own: Any = Field(None, description="Settings of the kind's own.", validate_default=True)
+
+    @property
+    def fit(self) -> Fit:
+        """The fit of this kind of model."""
+        return fit_named(self.kind)
 
     @model_validator(mode="before")
     @classmethod
     def _published(cls, given: Any) -> Any:
         """Fill in the defaults of the kind."""
-        if not isinstance(given, dict):
-            return given
-        kind = given.get("kind", "integrated")
-        published = PUBLISHED.get(kind, {}) if isinstance(kind, str) else {}
-        return {**published, **given}
+        fit = _fit_in(given)
+        return {**fit.published, **given} if fit else given
+
+    @field_validator("kind")
+    @classmethod
+    def _registered(cls, kind: str) -> str:
+        try:
+            fit_named(kind)
+        except InputError as error:
+            raise ValueError(str(error)) from error
+        return kind
 
     @field_validator("*")
     @classmethod
     def _belongs(cls, value: Any, info: ValidationInfo) -> Any:
-        kinds, kind = kinds_of(cls.model_fields[str(info.field_name)]), info.data.get("kind")
-        if kinds and kind is not None and kind not in kinds:
-            raise ValueError(f"is a setting of {', '.join(kinds)}, not of {kind}: omit it")
+        kind, name = info.data.get("kind"), str(info.field_name)
+        if kind is not None and not _takes(fit_named(kind), name):
+            kinds = ", ".join(other for other, fit in all_fits().items() if _takes(fit, name))
+            raise ValueError(f"is a setting of {kinds}, not of {kind}: omit it")
         return value
+
+    @field_validator("own")
+    @classmethod
+    def _of_its_own(cls, value: Any, info: ValidationInfo) -> Any:
+        own = fit_named(info.data["kind"]).own if "kind" in info.data else None
+        if own is not None:
+            return own.model_validate({} if value is None else value)
+        if value is not None:
+            raise ValueError(f"has no settings for {info.data.get('kind')}: omit it")
+        return None
 
     def has(self, name: str) -> bool:
         """Whether a setting belongs to this kind of model."""
-        kinds = kinds_of(type(self).model_fields[name])
-        return not kinds or self.kind in kinds
+        return _takes(self.fit, name)
 
     def looks_for(self, name: str) -> bool:
         """Whether an optional part belongs to this kind, and is to be fitted."""
@@ -152,27 +132,27 @@ class FitSettings(StrictModel):
 class TableSettings(StrictModel):
     """How text tables are read; not used for recordings."""
 
-    unit: CommandUnit | None = _of((), None, "Unit of the command.")
-    command_column: str | int | None = _of(
-        (), None, "Column name, or number from 1; default: current_a, or the only one in A or V."
+    unit: CommandUnit | None = _setting(None, "Unit of the command.")
+    command_column: str | int | None = _setting(
+        None, "Column name, or number from 1; default: current_a, or the only one in A or V."
     )
-    displacement_column: str | int | None = _of(
-        (), None, "The same for the displacement; default: displacement_um, or the only one in um."
+    displacement_column: str | int | None = _setting(
+        None, "The same for the displacement; default: displacement_um, or the only one in um."
     )
-    time_column: str | int | None = _of(
-        (), None, "The same for the time; default: t_s, or the only one in s, without rate_hz."
+    time_column: str | int | None = _setting(
+        None, "The same for the time; default: t_s, or the only one in s, without rate_hz."
     )
-    rate_hz: float | None = _of((), None, "Samples per second if there is no time column.", gt=0.0)
-    command_scale: float | None = _of((), None, "Unit of the command per unit of its column.")
-    displacement_scale: float | None = _of(
-        (), None, "um per unit of the displacement's column, as um per V of a sensor."
+    rate_hz: float | None = _setting(None, "Samples per second if there is no time column.", gt=0.0)
+    command_scale: float | None = _setting(None, "Unit of the command per unit of its column.")
+    displacement_scale: float | None = _setting(
+        None, "um per unit of the displacement's column, as um per V of a sensor."
     )
-    skip_rows: int = _of((), 0, "Lines at the start of a text table to skip.", ge=0)
-    first_row: int = _of((), 1, "First data row used, from 1.", ge=1)
-    last_row: int | None = _of((), None, "Last data row used; all if not set.", ge=1)
-    ignore: int = _of((), 0, "Rows at the start that are simulated but not evaluated.", ge=0)
-    lag_samples: int = _of((), 0, "Lag of the displacement in samples; or auto.", ge=0, le=10_000)
-    find_lag: bool = _of((), False, "Select the lag with the least error.")
+    skip_rows: int = _setting(0, "Lines at the start of a text table to skip.", ge=0)
+    first_row: int = _setting(1, "First data row used, from 1.", ge=1)
+    last_row: int | None = _setting(None, "Last data row used; all if not set.", ge=1)
+    ignore: int = _setting(0, "Rows at the start that are simulated but not evaluated.", ge=0)
+    lag_samples: int = _setting(0, "Lag of the displacement in samples; or auto.", ge=0, le=10_000)
+    find_lag: bool = _setting(False, "Select the lag with the least error.")
 
     @model_validator(mode="before")
     @classmethod
@@ -194,38 +174,47 @@ class IdentifySettings(FitSettings):
     @classmethod
     def _histories(cls, given: Any) -> Any:
         """Select whole histories for kinds that need the state of rest or large loops."""
-        if isinstance(given, dict) and given.get("kind") in _HISTORIES:
-            return {"whole": True, **given}
-        return given
+        fit = _fit_in(given)
+        return {"whole": True, **given} if fit and fit.whole else given
 
     def unit(self, recorded: CommandUnit | None) -> CommandUnit:
         """Return the unit of the command: that of the recordings if there are any."""
-        return recorded or self.table.unit or ("V" if self.kind in {"ppi", "spi"} else "A")
+        return recorded or self.table.unit or self.fit.unit
 
 
-def kinds_of(field: FieldInfo) -> tuple[str, ...]:
-    """Return the kinds of model that have a setting; none if all have it."""
-    extra = field.json_schema_extra
-    kinds = extra.get("kinds", []) if isinstance(extra, dict) else []
-    return tuple(map(str, kinds)) if isinstance(kinds, list) else ()
+def _fit_in(given: Any) -> Fit | None:
+    """Return the fit of unchecked settings; None if there is none of its name."""
+    kind = given.get("kind", "integrated") if isinstance(given, dict) else None
+    return fit_named(kind) if isinstance(kind, str) and kind in known(FITS) else None
+
+
+def _takes(fit: Fit, name: str) -> bool:
+    return name in fit.takes or name in _COMMON or name not in FitSettings.model_fields
 
 
 def setting_rows() -> Iterator[tuple[str, str, str, str, str]]:
     """Yield name, default, limits, kinds and meaning of all settings."""
+    fits = all_fits()
     for name, field in IdentifySettings.model_fields.items():
         if name == "table":
-            for key, inner in TableSettings.model_fields.items():
-                yield f"table.{key}", *_facts(inner, inner.default)
-            continue
-        own = {kind: values[name] for kind, values in PUBLISHED.items() if name in values}
-        others = "".join(f", {_text(value)} for {kind}" for kind, value in own.items())
-        default, limits, kinds, meaning = _facts(field, field.default)
-        yield name, default + others, limits, kinds, meaning
+            yield from (_row(f"table.{k}", each) for k, each in TableSettings.model_fields.items())
+        elif name == "own":
+            for kind, fit in fits.items():
+                inner = fit.own.model_fields if fit.own else {}
+                yield from (_row(f"own.{k}", each, kinds=[kind]) for k, each in inner.items())
+        else:
+            others = {k: fit.published[name] for k, fit in fits.items() if name in fit.published}
+            kinds = [kind for kind, fit in fits.items() if _takes(fit, name)]
+            row = _row(name, field, others, kinds if len(kinds) < len(fits) else ())
+            yield (*row[:2], ", ".join(fits), *row[3:]) if name == "kind" else row
 
 
-def _facts(field: FieldInfo, default: Any) -> tuple[str, str, str, str]:
-    kinds = ", ".join(kinds_of(field)) or "all"
-    return _text(default), _limits(field), kinds, str(field.description)
+def _row(
+    name: str, field: FieldInfo, others: Choices = NO_CHOICES, kinds: Sequence[str] = ()
+) -> tuple[str, str, str, str, str]:
+    default = _text(field.default)
+    default += "".join(f", {_text(value)} for {kind}" for kind, value in others.items())
+    return name, default, _limits(field), ", ".join(kinds) or "all", str(field.description)
 
 
 def _limits(field: FieldInfo) -> str:

@@ -18,7 +18,7 @@ from tests.unit.lab.identify.test_refinement import OLD, actuator, history
 
 def test_every_setting_is_listed(hilctl):
     shown = {*hilctl("identify", "--settings")[1].split()}
-    assert {*IdentifySettings.model_fields.keys() - {"table"}, "table.rate_hz"} <= shown
+    assert {*IdentifySettings.model_fields.keys() - {"table", "own"}, "table.rate_hz"} <= shown
 
 
 @pytest.fixture

@@ -19,7 +19,6 @@ SPIKE_STROKE = 0.02  # smallest spike or step, of the stroke of all other sample
 JUMP = 0.05  # of the command's range: a step of the command is no fault
 CLIPPED, FEWEST_CLIPPED = 0.05, 5  # motion of the command, of its range, and samples at one value
 LARGE = 0.1  # of the largest swing: smaller ones are ignored
-OWN_OFFSET = ("field", "generalised_duhem")  # kinds whose offset is fitted always
 DEAD, FEWEST_DEAD = 0.1, 2  # of the usual displacement per command; swings in a row
 
 
@@ -148,7 +147,7 @@ def _without(record: Record, start: int, stop: int) -> str:
 
 def _far_from_zero(record: Record, settings: FitSettings) -> str:
     """Return that the displacement has a constant that the model lacks."""
-    if settings.kind in OWN_OFFSET:
+    if settings.fit.has_offset:
         return ""
     middle_um = 0.5 * float(record.displacement_um.max() + record.displacement_um.min())
     if abs(middle_um) < float(np.ptp(record.displacement_um)):

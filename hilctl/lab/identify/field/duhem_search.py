@@ -31,6 +31,7 @@ from hilctl.lab.identify.field.stages import (
 from hilctl.lab.identify.field.stages import NAMES as STAGES
 from hilctl.lab.identify.fit_api import FitJob, FoundModel, OnProgress, Structure
 from hilctl.lab.identify.parallel import parallel_map
+from hilctl.lab.identify.registry import HISTORIES, STAGE_SETTINGS, Fit
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
 from hilctl.models.staged import StagedModel
 
@@ -424,3 +425,15 @@ def _model(job: FitJob, found: DuhemEnd) -> StagedModel:
         **job.data.common(found.offset_um),
     )
     return StagedModel.around(hysteresis, structure=known.structure, delay_s=known.delay_s)
+
+
+GENERALISED_DUHEM = Fit(
+    "generalised Duhem: slopes by place and direction, with losses",
+    "slopes and stages together, with a smoothness prior",
+    HISTORIES,
+    fit_generalised_duhem,
+    takes=(*STAGE_SETTINGS, "cells", "across"),
+    whole=True,
+    has_lag=True,
+    has_offset=True,
+)

@@ -33,6 +33,7 @@ from hilctl.lab.identify.field.stages import (
 from hilctl.lab.identify.fit_api import FitJob, FoundModel, OnProgress, Structure
 from hilctl.lab.identify.least_squares import SearchPoint, settle
 from hilctl.lab.identify.parallel import parallel_map
+from hilctl.lab.identify.registry import HISTORIES, STAGE_SETTINGS, Fit
 from hilctl.models.effective_field import FieldModel, OutputCurve
 from hilctl.models.staged import StagedModel
 
@@ -373,3 +374,16 @@ def tabled(splines: F64) -> list[list[float]]:
     pieces = splines.shape[1] - 2
     found = sum(splines[:, k : k + pieces, None] * part for k, part in enumerate(parts))
     return np.reshape(found, (len(splines), -1)).tolist()
+
+
+FIELD = Fit(
+    "plays of an effective field, with its losses",
+    "densities by non-negative least squares, stages by search",
+    HISTORIES,
+    fit_field,
+    takes=(*STAGE_SETTINGS, "plays", "cells", "activation", "knots"),
+    published={"plays": 32, "cells": 12},
+    whole=True,
+    has_lag=True,
+    has_offset=True,
+)

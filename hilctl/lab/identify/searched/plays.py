@@ -1,7 +1,7 @@
 """Searches of play models (PPI, RDPI, integrated): bounded least squares from several starts."""
 
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import Any, NamedTuple, TypeAlias
 
 import numpy as np
@@ -13,6 +13,7 @@ from hilctl.lab.identify.evaluation import weight_roots
 from hilctl.lab.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel, OnProgress, StartOutcome
 from hilctl.lab.identify.fit_data import GAMMA_S, SPACING, FitData
 from hilctl.lab.identify.least_squares import bounded_and_free, converged, first_least
+from hilctl.lab.identify.registry import ANY, SEARCH_SETTINGS, Fit
 from hilctl.lab.identify.settings import FitSettings
 from hilctl.models.integrated import IntegratedModel, exponential_integrated, exponential_weights
 from hilctl.models.plays import PlayModel, PpiModel, RdpiModel, SpiModel
@@ -279,6 +280,34 @@ class PlaysProblem:
 def fit_plays(job: FitJob) -> FoundModel:
     """Fit a PPI, SPI or RDPI."""
     return searched_fit(PlaysProblem(job.data, job.settings), job)
+
+
+FOUND_BY = "least squares from several starts"
+_TAKES = (*SEARCH_SETTINGS, "weights", "layout", "creep")
+_FREE: Mapping[str, Any] = {"plays": 12, "weights": "free", "weight_by": "equal", "offset": True}
+"""Settings to compare with Omega: the error of a simpler model must not be due to few parameters.
+"""
+PPI = Fit(
+    "PI: no rate, no deadbands (3.25-3.27)",
+    FOUND_BY,
+    ANY,
+    fit_plays,
+    takes=_TAKES,
+    published={"plays": 10},  # section 3.4.2
+    compared=_FREE,
+    unit="V",
+    whole=True,
+)
+SPI = replace(PPI, title="PI, undone by stop operators (3.11-3.24)", compared=None)
+RDPI = Fit(
+    "rate-dependent PI: no deadbands (5.11, 5.14)",
+    FOUND_BY,
+    ANY,
+    fit_plays,
+    takes=_TAKES,
+    published={"plays": 4, "weights": "free", "weight_by": "hysteresis", "points": 400},  # 5.3
+    compared=_FREE,
+)
 
 
 STEEPEST = 5.0  # largest slope of the deadband function, relative to that around 0

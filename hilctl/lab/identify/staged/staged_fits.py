@@ -19,6 +19,8 @@ from hilctl.lab.identify.evaluation import weight_roots
 from hilctl.lab.identify.fit_api import LEAST_SLOPE, FitJob, FoundModel, StartOutcome
 from hilctl.lab.identify.fit_data import FitData, Linear
 from hilctl.lab.identify.least_squares import bounded_weights, descend, first_least
+from hilctl.lab.identify.registry import ANY, SEARCH_SETTINGS, Fit
+from hilctl.lab.identify.searched.plays import FOUND_BY, fit_exponential
 from hilctl.lab.identify.staged.objective import (
     RADIAN,
     STEEPEST,
@@ -34,7 +36,6 @@ from hilctl.lab.identify.staged.objective import (
     staged_model,
 )
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import StagedModel
 
 KNOTS = 16  # of Lambda^-1
@@ -297,3 +298,37 @@ def _found(
     known = {name: value for name, (value, _) in by.items()}
     errors = standard_errors(end, by, data.places)
     return FoundModel(model, len(known) - 1, known, end.starts, errors, at_bound(end, by))
+
+
+def _fit_integrated(job: FitJob) -> FoundModel:
+    return fit_free(job) if job.settings.weights == "free" else fit_exponential(job)
+
+
+INTEGRATED = Fit(
+    "integrated, Omega: rate, asymmetry (6.18-6.24)",
+    FOUND_BY,
+    ANY,
+    _fit_integrated,
+    takes=(*SEARCH_SETTINGS, "deadbands", "weights"),
+    compared={"starts": 3},
+)
+ASYMMETRIC = Fit(
+    "Omega with gamma = 0: no rate (1.14-1.16)",
+    FOUND_BY,
+    ANY,
+    fit_free,
+    takes=(*SEARCH_SETTINGS, "deadbands"),
+    published={"offset": True},
+    compared={},
+)
+STAGED = Fit(
+    "Omega between field lag, structure and delay",
+    "all parts together",
+    "steady loops at one sample rate",
+    fit_staged,
+    takes=(*SEARCH_SETTINGS, "deadbands"),
+    # Nothing is published for staged models: these met the published figures on the simulated rig.
+    published={"plays": 20, "deadbands": 12, "offset": True, "starts": 4},
+    compared={},
+    has_lag=True,
+)

@@ -23,7 +23,7 @@ from hilctl.lab.identify.fit_model import (
     identified_range,
     without_creep,
 )
-from hilctl.lab.identify.settings import FitKind, FitSettings
+from hilctl.lab.identify.settings import FitSettings
 from hilctl.models.integrated import IntegratedModel, even_thresholds
 from hilctl.models.linear_stages import CreepModel, FurtherMode
 from hilctl.models.model_file import dump_model, parse_model
@@ -37,7 +37,7 @@ Loops = Callable[..., list[SteadyLoop]]
 GRID = [(a, f) for a in (3.0, 6.0) for f in (10.0, 50.0, 100.0, 150.0, 250.0)]
 
 
-def fit(kind: FitKind, data: Records, unit: CommandUnit = "A", **choices: Any) -> FittedModel:
+def fit(kind: str, data: Records, unit: CommandUnit = "A", **choices: Any) -> FittedModel:
     return fit_model(FitRequest(data, FitSettings(kind=kind, **choices), unit=unit))
 
 

@@ -17,7 +17,7 @@ from hilctl.lab.identify.data.records import History
 from hilctl.lab.identify.evaluation import judge
 from hilctl.lab.identify.fit_api import FitJob, FitRequest
 from hilctl.lab.identify.fit_model import FittedModel, fit_model
-from hilctl.lab.identify.registry import CATALOGUE, entry
+from hilctl.lab.identify.registry import all_fits, fit_named
 from hilctl.lab.identify.settings import FitSettings, TableSettings
 from hilctl.models.plays import PpiModel
 
@@ -33,19 +33,18 @@ TRUTH = PpiModel(direct=4.0, weights=(1.0, 2.0), thresholds=(0.5, 1.5))
 
 @pytest.mark.parametrize(("kind", "model"), QUICK.items())
 def test_what_is_found_is_of_the_kind_that_was_asked_for(data_of, kind, model):
-    name, known = entry(kind)
-    found = known.fit(FitJob(data_of(TRUTH), FitSettings(kind=name)))
+    found = fit_named(kind).fit(FitJob(data_of(TRUTH), FitSettings(kind=kind)))
     assert found.model.kind == model
     assert found.numbers >= 1
 
 
 def test_a_slip_of_the_finger_is_answered_with_the_nearest_kind():
     with pytest.raises(InputError, match=r"'duhm'.*duhem"):
-        entry("duhm")
+        fit_named("duhm")
 
 
 def test_no_two_kinds_have_one_title():
-    assert len({each.title for each in CATALOGUE.values()}) == len(CATALOGUE)
+    assert len({each.title for each in all_fits().values()}) == len(all_fits())
 
 
 FOLDER = Path(__file__).resolve().parents[5] / "shared" / "data" / "yan9a_DBO"

@@ -7,14 +7,12 @@ from hilctl.lab.identify.data.records import History, SteadyLoop
 from hilctl.lab.identify.evaluation import judge
 from hilctl.lab.identify.fit_api import FitJob
 from hilctl.lab.identify.fit_data import FitData
-from hilctl.lab.identify.literature import (
-    fit_bouc_wen,
-    fit_duhem,
-    fit_generalised,
-    fit_kp,
-    fit_preisach,
-    fit_straight,
-)
+from hilctl.lab.identify.literature.bouc_wen import fit_bouc_wen
+from hilctl.lab.identify.literature.duhem import fit_duhem
+from hilctl.lab.identify.literature.generalised_plays import fit_generalised
+from hilctl.lab.identify.literature.krasnoselskii import fit_kp
+from hilctl.lab.identify.literature.preisach import fit_preisach
+from hilctl.lab.identify.literature.straight import fit_straight
 from hilctl.lab.identify.settings import FitSettings
 from hilctl.lab.identify.staged.staged_fits import fit_free
 from hilctl.models.bouc_wen import BoucWenModel

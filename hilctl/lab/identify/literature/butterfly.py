@@ -13,6 +13,8 @@ from hilctl.base.types import F64
 from hilctl.lab.identify.data.records import SteadyLoop
 from hilctl.lab.identify.fit_api import FitJob, FoundModel
 from hilctl.lab.identify.least_squares import first_least
+from hilctl.lab.identify.literature.weights import WEIGHTS_FOLLOW
+from hilctl.lab.identify.registry import LOOPS, Fit
 from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.integrated import DeadbandFunction
 
@@ -146,3 +148,14 @@ def _sides(loop: SteadyLoop, turning_um: float) -> F64:
         both = command[: cuts[0]].sum() + command[cuts[-1] :].sum()
         side[: cuts[0]] = side[cuts[-1] :] = 1.0 if both >= 0.0 else -1.0
     return np.roll(side, start)
+
+
+BUTTERFLY = Fit(
+    "plays, then an even function: rods without bias",
+    WEIGHTS_FOLLOW,
+    LOOPS,
+    fit_butterfly,
+    takes=("plays", "turning_um", "magnets"),
+    published={"plays": 16},
+    is_even=True,
+)

@@ -1,0 +1,1 @@
+"""Fits of models of the literature, one module per kind."""
