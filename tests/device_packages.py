@@ -1,4 +1,4 @@
-"""Packages of ``tests/data`` with devices, installed for a test."""
+"""Packages of ``tests/data`` with devices or kinds of model, installed for a test."""
 
 import configparser
 import os
@@ -7,6 +7,7 @@ from importlib.metadata import EntryPoint
 from pathlib import Path
 
 from hilctl.experiment import devices
+from hilctl.models import kinds
 
 DATA = Path(__file__).parent / "data"
 
@@ -38,6 +39,12 @@ def installed(name, site):
 def installed_here(name, monkeypatch):
     """Install a package into this process."""
     monkeypatch.syspath_prepend(DATA / name)
-    points = project(name)["entry-points"][devices.GROUP].items()
-    found = [EntryPoint(key, value, devices.GROUP) for key, value in points]
-    monkeypatch.setattr(devices, "entry_points", lambda group: found)
+    known = project(name)["entry-points"]
+
+    def found(group):
+        return [EntryPoint(key, value, group) for key, value in known.get(group, {}).items()]
+
+    monkeypatch.setattr(devices, "entry_points", found)
+    monkeypatch.setattr(
+        kinds, "registered", lambda group: {point.name: point for point in found(group)}
+    )

@@ -10,7 +10,6 @@ from hypothesis.extra import numpy as hnp
 
 from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
-from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 
 SAMPLE_RATE_HZ = 20_000.0
@@ -202,12 +201,3 @@ def test_deadbands_rise(function, values):
     rounding = 1e-12 * size_of(function(x))
     assert np.all(rise >= 0.0999 * run - rounding)
     assert np.all(rise <= 10.001 * run + rounding)
-
-
-@given(models(), signals())
-def test_a_model_survives_its_file(model, v):
-    back = parse_model("round trip", dump_model(model))
-    assert back == model
-    for direction in ("forward", "inverse"):
-        out = operator_of(model, direction).process(v)
-        np.testing.assert_array_equal(bits(operator_of(back, direction).process(v)), bits(out))

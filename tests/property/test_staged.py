@@ -7,7 +7,6 @@ from hypothesis.extra import numpy as hnp
 
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.linear_stages import FirstMode, smoothing_weights
-from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 
@@ -118,8 +117,3 @@ def test_inverse_meets_what_the_lag_can_follow(model, signal):
     came = model.forward(rate_hz).process(np.concatenate((command, rest)))[inverse.preview :]
     scale = 1e-9 * (1.0 + np.abs(command).max() * 100.0) * 10.0
     np.testing.assert_allclose(came, signal[inverse.preview :], rtol=0.0, atol=scale)
-
-
-@given(models())
-def test_files_keep_every_bit(model):
-    assert parse_model("text", dump_model(model)) == model

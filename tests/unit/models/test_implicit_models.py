@@ -15,7 +15,6 @@ from hilctl.models.duhem import DuhemModel
 from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
 from hilctl.models.implicit_models import TOLERANCE_UM
 from hilctl.models.krasnoselskii import KrasnoselskiiPokrovskiiModel
-from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.preisach import PreisachModel
 
 RATE_HZ = 50_000.0
@@ -179,11 +178,6 @@ def test_samples_on_the_way_make_no_difference(model, v, part):
     coarse = model.forward(RATE_HZ).process(v)
     fine = model.forward(RATE_HZ).process(finer)[::2]
     np.testing.assert_allclose(fine, coarse, rtol=1e-8, atol=1e-8)
-
-
-@given(MODELS)
-def test_a_model_survives_its_file(model):
-    assert parse_model("round trip", dump_model(model)) == model
 
 
 @pytest.mark.parametrize("model", [PREISACH, KP, BOUC_WEN, DUHEM], ids=lambda m: m.kind)

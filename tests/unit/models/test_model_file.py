@@ -6,7 +6,7 @@ import yaml
 from hilctl.base.errors import ConfigError
 from hilctl.models.base import Provenance
 from hilctl.models.integrated import IntegratedModel, exponential_integrated
-from hilctl.models.model_file import dump_model, load_model, parse_model
+from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import SpiModel
 from tests.published import piezo_ppi, terfenol_rdpi
 
@@ -36,15 +36,6 @@ def test_a_model_is_shown_in_one_line():
     text = str(terfenol_rdpi())
     assert text.startswith("RdpiModel(kind='rdpi', input_unit='A', ")
     assert f"weights=<tuple of {terfenol_rdpi().operators}>" in text
-
-
-@pytest.mark.parametrize("model", MODELS, ids=lambda model: model.kind)
-def test_round_trip_gives_the_same_model(model, tmp_path):
-    text = dump_model(model)
-    assert parse_model("text", text) == model
-    path = tmp_path / "model.yaml"
-    path.write_text(text, encoding="utf-8")
-    assert load_model(path) == model
 
 
 def test_all_of_a_model_survives():

@@ -4,7 +4,6 @@ import numpy as np
 import pytest
 from pydantic import ValidationError
 
-from hilctl.base.errors import ModelError
 from hilctl.models.base import Provenance
 from hilctl.models.integrated import exponential_integrated
 from hilctl.models.linear_stages import CreepModel, FirstMode, FurtherMode
@@ -120,19 +119,3 @@ def test_corners_of_a_triangle_are_rounded_and_excite_no_resonance(rate_hz, damp
     begun, corner = t[: came.size] > 0.01, np.mod(100.0 * t[: came.size] - 0.25, 0.5)
     assert error[begun].max() < 0.01
     assert error[begun & (np.minimum(corner, 0.5 - corner) > 0.05)].max() < 1e-3
-
-
-def test_state_goes_back_and_another_model_s_is_refused():
-    operator = StagedModel.around(OMEGA, **STAGES["all"]).inverse(RATE_HZ)
-    reference = sine(250.0, 400)
-    operator.process(reference[:150])
-    state = operator.state()
-    rest = operator.process(reference[150:])
-    operator.restore(state)
-    np.testing.assert_array_equal(operator.process(reference[150:]), rest)
-    operator.reset()
-    first = operator.process(reference)
-    operator.reset()
-    np.testing.assert_array_equal(operator.process(reference), first)
-    with pytest.raises(ModelError, match="state must have"):
-        operator.restore(state[:-1])

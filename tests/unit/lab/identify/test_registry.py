@@ -1,4 +1,4 @@
-"""Every kind of model has one way to be found, and that way gives that kind.
+"""Fits by name, and one of them on measured data.
 
 A PPI is identified on measured data of a piezo micromanipulator, and tried on other data of it.
 Data: github.com/yan9a/DiscreteBacklashOperator, MIT licence. Drive in V, capacitive sensor, 200 Hz.
@@ -15,36 +15,15 @@ from hilctl.lab.identify.data.cycles import find_cycles
 from hilctl.lab.identify.data.data_files import read_table
 from hilctl.lab.identify.data.records import History
 from hilctl.lab.identify.evaluation import judge
-from hilctl.lab.identify.fit_api import FitJob, FitRequest
+from hilctl.lab.identify.fit_api import FitRequest
 from hilctl.lab.identify.fit_model import FittedModel, fit_model
-from hilctl.lab.identify.registry import all_fits, fit_named
+from hilctl.lab.identify.registry import fit_named
 from hilctl.lab.identify.settings import FitSettings, TableSettings
-from hilctl.models.plays import PpiModel
-
-QUICK = {
-    "straight": "ppi",  # without plays
-    "duhem": "duhem",
-    "preisach": "preisach",
-    "kp": "krasnoselskii_pokrovskii",
-    "ppi": "ppi",
-}
-TRUTH = PpiModel(direct=4.0, weights=(1.0, 2.0), thresholds=(0.5, 1.5))
-
-
-@pytest.mark.parametrize(("kind", "model"), QUICK.items())
-def test_what_is_found_is_of_the_kind_that_was_asked_for(data_of, kind, model):
-    found = fit_named(kind).fit(FitJob(data_of(TRUTH), FitSettings(kind=kind)))
-    assert found.model.kind == model
-    assert found.numbers >= 1
 
 
 def test_a_slip_of_the_finger_is_answered_with_the_nearest_kind():
     with pytest.raises(InputError, match=r"'duhm'.*duhem"):
         fit_named("duhm")
-
-
-def test_no_two_kinds_have_one_title():
-    assert len({each.title for each in all_fits().values()}) == len(all_fits())
 
 
 FOLDER = Path(__file__).resolve().parents[5] / "shared" / "data" / "yan9a_DBO"

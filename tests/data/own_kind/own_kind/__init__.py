@@ -1,0 +1,1 @@
+"""A gain with backlash, as a kind of model."""
