@@ -12,7 +12,6 @@ from hilctl.lab.contract import *  # noqa: F403  the checks, and the fixture dir
 from hilctl.lab.contract import KindCase
 from hilctl.lab.identify.registry import all_fits
 from hilctl.models import kinds
-from hilctl.models.backlash import BacklashModel
 from hilctl.models.plays import PpiModel, SpiModel
 from hilctl.models.staged import StagedModel
 from tests import device_packages
@@ -55,7 +54,6 @@ CASES = {
     "bouc_wen": KindCase(BOUC_WEN, fit="bouc_wen", fit_percent=0.01),
     "exponent 2": KindCase(BOUC_WEN_2, fit="bouc_wen", fit_percent=0.01),
     "duhem": KindCase(DUHEM, fit="duhem", fit_percent=0.01),
-    "one_play": KindCase(BacklashModel(gain=4.0, weight=2.0, threshold=1.5), fit="one_play"),
     "staged": KindCase(StagedModel.around(OMEGA, **STAGES["all"]), inverse_percent=0.1,
                        fit="staged", settings={"plays": 8, "deadbands": 4, "starts": 1}),
     "linear lag": KindCase(StagedModel.around(OMEGA, **STAGES["linear lag"])),
