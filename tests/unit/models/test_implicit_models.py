@@ -126,11 +126,6 @@ def signals(low, high):
 
 
 MODELS = st.one_of(preisachs(), kps(), bouc_wens(), duhems(), generaliseds())
-DIRECTION = st.sampled_from(("forward", "inverse"))
-
-
-def bits(array):
-    return np.ascontiguousarray(array).view(np.uint64)
 
 
 @given(MODELS, signals(*SPAN))
@@ -145,18 +140,6 @@ def test_the_model_undoes_its_inverse(model, v):
 def test_the_inverse_never_leaves_its_span(model, y):
     command = model.inverse(RATE_HZ).process(y)
     assert np.all((command >= LOW) & (command <= HIGH))
-
-
-@given(MODELS, signals(-90.0, 90.0), DIRECTION, st.data())
-def test_any_cut_into_blocks_gives_the_same_bits(model, signal, direction, data):
-    whole = getattr(model, direction)(RATE_HZ)
-    expected = whole.process(signal)
-    cuts = sorted(data.draw(st.lists(st.integers(0, signal.size), max_size=8)))
-    for edges in (cuts, range(1, signal.size)):
-        pieces = getattr(model, direction)(RATE_HZ)
-        out = [pieces.process(block) for block in np.split(signal, list(edges))]
-        np.testing.assert_array_equal(bits(np.concatenate(out)), bits(expected))
-        np.testing.assert_array_equal(bits(pieces.state()), bits(whole.state()))
 
 
 @given(MODELS, signals(*SPAN), st.data())
