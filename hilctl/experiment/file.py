@@ -138,15 +138,7 @@ class Experiment(StrictModel):
 
     def command_limits(self) -> CommandLimits:
         """Return the settings of the limiter, in the device's unit."""
-        low, high = self.limits.command_range
-        furthest = max(high - self.safe.value, self.safe.value - low)
-        return CommandLimits(
-            low=low,
-            high=high,
-            slew_per_s=self.limits.slew_per_s,
-            safe=self.safe.value,
-            ramp_per_s=min(self.limits.slew_per_s, furthest / self.safe.ramp_s),
-        )
+        return self.limits.of_command(self.safe)
 
 
 def experiment_schema() -> dict[str, Any]:

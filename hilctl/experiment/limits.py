@@ -11,7 +11,9 @@ from hilctl.base.strict import BeforeValidator, Field, model_validator
 from hilctl.base.types import CommandUnit
 from hilctl.experiment.forecast import Forecast
 from hilctl.experiment.rig import RunRig
+from hilctl.experiment.safe import Safe
 from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
+from hilctl.loop.limiter import CommandLimits
 
 _ROUNDING = 1e-9  # of the range of commands
 _TRACKING_SHARE = 0.25  # of limits.stroke_um
@@ -91,6 +93,18 @@ class Limits(InterlockSettings):
     def slew_per_s(self) -> float:
         """Fastest change of the command, in :attr:`unit` per second."""
         return self.slew_v_per_s or self.slew_a_per_s or 0.0
+
+    def of_command(self, safe: Safe) -> CommandLimits:
+        """Return the settings of the limiter, in :attr:`unit`."""
+        low, high = self.command_range
+        furthest = max(high - safe.value, safe.value - low)
+        return CommandLimits(
+            low=low,
+            high=high,
+            slew_per_s=self.slew_per_s,
+            safe=safe.value,
+            ramp_per_s=min(self.slew_per_s, furthest / safe.ramp_s),
+        )
 
     def tracking(self, rate_hz: float) -> InterlockSettings:
         """Return the interlocks of a compensated run, with the default of its tracking error."""
