@@ -93,13 +93,16 @@ class Signals:
         return parallel_map(lambda run: signals(run, known, flux, span), self.data.runs)
 
 
+WAY = 0.02  # maximum distance of two points of a path, of the span
+
+
 class Points:
     """Chosen points of all paths: turns, and at most ``way`` of the command's span apart.
 
     Paths that return by less than ``turn`` of the span do not turn.
     """
 
-    def __init__(self, signals: Signals, x: F64, way: float, turn: float) -> None:
+    def __init__(self, signals: Signals, x: F64, turn: float, way: float = WAY) -> None:
         span, self._signals = 2.0 * signals.data.reach, signals
         self._kept: list[I64] = []
         for field, _ in signals.whole(x):
@@ -141,13 +144,10 @@ COARSE = Phase(rows=4000, steps=18, gain=3e-2, held=1e-2, fades=True)
 TABLE_ALONE = replace(COARSE, steps=3, gain=0.0, firm=3000.0, stages=False)
 FINE = Phase(rows=12_000, steps=8, gain=3e-3, held=3e-4)
 COARSE_CELLS = (12, 8)  # of the first table
-COARSE_WAY, FINE_WAY = 0.03, 0.02  # maximum distance of two points of a path, of the span
 COARSE_TURN, FINE_TURN = 3e-3, 1e-3  # of the span: minimum return after a turn
 STEEPEST = 5.0  # logarithm of the largest slope, of the mean
-SHORT_GAIN = 0.03  # factor of the gain, if the damping of the step was raised
 TRIALS = 12  # dampings of a step; a start that is far off needs the largest
 FIRST_DAMPING, LEAST_DAMPING = 1e-4, 1e-9
-REFUSED_DAMPING = 1e-5  # minimum after a rejected step
 TRUSTED = 0.1  # of the gain predicted by the derivatives: a step that gains less is rejected
 DIFFERENCE = 0.2  # step of numerical derivatives, of the step of a stage
 
@@ -205,7 +205,6 @@ class DuhemProblem:
         cost = self._cost(x, logs, errors)
         for _ in range(self._phase.steps):
             normal, down = self._normal(x, logs, errors)
-            first = damping
             for _ in range(TRIALS):
                 low, high = self._bounds.low, self._bounds.high
                 step = _bounded_step(normal, down, damping, logs.size, x, (low, high))
@@ -215,13 +214,12 @@ class DuhemProblem:
                     to_cost = self._cost(to_x, to_logs, to_errors)
                     if cost - to_cost > TRUSTED * float(step @ (2.0 * down - normal @ step)):
                         break
-                damping = max(10.0 * damping, REFUSED_DAMPING)
+                damping *= 10.0
             else:
                 break
             gained = 1.0 - to_cost / cost
             x, logs, errors, cost = to_x, to_logs, to_errors, to_cost
-            # The gain of a short step, after rejected ones, does not tell what is left to gain.
-            if gained <= self._phase.gain * (1.0 if damping == first else SHORT_GAIN):
+            if gained <= self._phase.gain:
                 break
             damping = max(0.1 * damping, LEAST_DAMPING)
         return x, logs
@@ -335,7 +333,7 @@ class DuhemSearch:
     def find(self, progress: OnProgress) -> DuhemEnd:
         """Search with a coarse table, then with the requested size."""
         x = self._bounds.first.copy()
-        points = Points(self._signals, x, COARSE_WAY, COARSE_TURN)
+        points = Points(self._signals, x, COARSE_TURN)
         layout = laid_over(points.paths(x), *COARSE_CELLS)
         first_um = layout.rest_um(*self._signals.whole(x)[0])
         logs = layout.first_logs()
@@ -355,7 +353,7 @@ class DuhemSearch:
 
     def _end(self, x: F64, logs: F64, before: Layout, first_um: float) -> DuhemEnd:
         """Search with a table of the requested size, from another table."""
-        points = Points(self._signals, x, FINE_WAY, FINE_TURN)
+        points = Points(self._signals, x, FINE_TURN)
         # Slopes have a kink on the anhysteretic line, which nodes represent and cells would not.
         line = before.nodes_um, before.anhysteretic(logs)
         layout = laid_over(points.paths(x), *self._size, line)

@@ -164,11 +164,11 @@ def test_the_flux_can_be_a_root_of_the_strain_nearly_down_to_where_that_begins()
 def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for():
     records = data()
     signals, (run,) = Signals(records), records.runs
-    points = Points(signals, FIRST, 1e-9, 0.0)
+    points = Points(signals, FIRST, 0.0, 1e-9)
     (path,), (motion,) = points.paths(FIRST), points.motions
     assert path.field.size == path.displacement_um.size == run.kept.size
     assert motion.judged.size == path.field.size
-    (coarse,) = Points(signals, FIRST, 0.05, 1e-3).paths(FIRST)
+    (coarse,) = Points(signals, FIRST, 1e-3, 0.05).paths(FIRST)
     assert coarse.field.size < path.field.size / 2
     between = np.abs(np.diff(path.field)).max()
     assert np.abs(np.diff(coarse.field)).max() <= 0.05 * 2.0 * records.reach + between
@@ -179,7 +179,7 @@ def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for():
 
 @pytest.mark.parametrize("stage", [k for k, name in enumerate(NAMES) if name != "activation"])
 def test_paths_follow_every_stage_but_the_offset(stage):
-    kept, fresh = (Points(Signals(data()), FIRST, 0.02, 1e-3) for _ in range(2))
+    kept, fresh = (Points(Signals(data()), FIRST, 1e-3) for _ in range(2))
     (before,) = kept.paths(FIRST)
     x = FIRST.copy()
     x[stage] += STEPS[stage]
@@ -200,7 +200,7 @@ SETTINGS = FitSettings(kind="generalised_duhem", cells=10, across=8)
 def ready(unit: float = 1.0, um: float = 1.0, steps: int = 3) -> tuple[DuhemProblem, F64]:
     """Return a problem, and its first logarithms."""
     signals = Signals(data(unit, um))
-    points = Points(signals, FIRST, 0.03, 1e-3)
+    points = Points(signals, FIRST, 1e-3)
     here = laid_over(points.paths(FIRST), 8, 6)
     bounds = Bounds(LOWEST, HIGHEST, FIRST, (float(np.log(0.05 * um / unit)), 10.0))
     phase = Phase(rows=500, steps=steps, gain=0.0, held=1e-2)
@@ -284,7 +284,7 @@ def spread(end: DuhemEnd) -> float:
     """Return the rms error of the field at the end of a search of the record."""
     (run,) = data().runs
     signals = Signals(data())
-    points = Points(signals, end.x, 0.02, 1e-3)
+    points = Points(signals, end.x, 1e-3)
     bounds = Bounds(LOWEST, HIGHEST, FIRST, (-10.0, 10.0))
     first_um = end.offset_um - float(end.x[-1]) * 0.5 * float(np.ptp(run.derivatives[0]))
     job = DuhemProblem(signals, points, end.layout, first_um, bounds, FINE)
