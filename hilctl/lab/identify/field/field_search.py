@@ -1,4 +1,4 @@
-"""Fit of the effective-field model: stages from a few starts, weights round by round."""
+"""Fit of the effective-field model: stages by search, weights round by round."""
 
 from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
@@ -123,7 +123,6 @@ class JointRefinement:
 MARGIN = 0.1  # of the span: margin of the tables beyond the data
 SEARCH_ROWS, POLISH_ROWS, FINAL_ROWS = 2500, 4000, 12_000
 ROUNDS = 2
-FIRST_LAGS = (0.02, 0.1, 0.4)  # lags of the field of the starts
 NEAR_BOUND = 0.95
 STIFFER = (0.02, 0.05)  # radians of further starts, if the first ends at a bound
 LEAST_WIDEST = 0.1  # minimum of the largest threshold, of half the span
@@ -206,11 +205,11 @@ class FieldSearch:
         return self._end(self._space.within(stages_of(end.known, self._data)), end.grid)
 
     def _descended(self, first: Stages, progress: OnProgress, done: float) -> "_Descent":
-        """Return the descent from the best of some starts."""
-        coarse = self._size.coarse
-        tried = [self._tried(replace(first, field=lag), coarse) for lag in FIRST_LAGS]
-        x = row(min(tried, key=lambda each: each[0])[1])
-        self._forget()
+        """Return the descent from a start."""
+        coarse, x = self._size.coarse, row(first)
+        self._curve = self._grid = None
+        self._widest = 1.0
+        self._off_um = np.zeros(self._rows.scale.size)
         for turn in range(ROUNDS):
             part = (turn + 0.2) / (ROUNDS + 1)
             progress(done + (1.0 - done) * part, f"round {turn + 1} of {ROUNDS}")
@@ -220,20 +219,6 @@ class FieldSearch:
             x, _ = self._polish(x)
             self._learn(x)
         return _Descent(self._error(x), stages_in(x), self._curve, self._grid, self._widest)
-
-    def _forget(self) -> None:
-        self._curve = self._grid = None
-        self._widest = 1.0
-        self._off_um = np.zeros(self._rows.scale.size)
-
-    def _tried(self, stages: Stages, size: Size) -> tuple[float, Stages]:
-        """Return the error of a start after two solutions for its weights."""
-        self._forget()
-        for _ in range(2):
-            self._lay(stages, size)
-            self._learn(row(stages))
-        self._lay(stages, size)
-        return self._error(row(stages)), stages
 
     def _polish(self, x: F64) -> tuple[F64, Grid]:
         """Return better stages and thresholds."""

@@ -9,7 +9,6 @@ import pytest
 from hilctl.base.types import F64
 from hilctl.lab.identify.data.records import History
 from hilctl.lab.identify.evaluation import judge
-from hilctl.lab.identify.field import field_search
 from hilctl.lab.identify.field.densities import Equations, Grid, outputs, table
 from hilctl.lab.identify.field.field_search import (
     ROOM,
@@ -111,14 +110,6 @@ def test_progress_rises_below_1_and_names_each_round():
     assert 0.0 < parts[0] <= parts[-1] < 1.0
     rounds = [f"round {i} of {ROUNDS}" for i in range(1, ROUNDS + 1)]
     assert [what for _, what in seen] == rounds * (len(seen) // ROUNDS)
-
-
-def test_of_the_starts_the_one_with_the_least_error_is_followed(monkeypatch):
-    with monkeypatch.context() as patch:
-        patch.setattr(field_search, "FIRST_LAGS", field_search.FIRST_LAGS[::-1])
-        end = found.__wrapped__()
-    assert end.known == found().known
-    assert np.array_equal(end.weights.slopes, found().weights.slopes)
 
 
 def test_a_search_that_goes_on_from_another_of_its_data_ends_no_worse():
