@@ -19,17 +19,17 @@ from hilctl.base.types import F64
 from hilctl.kernels.hysteresis import stop_step
 from hilctl.lab.pages.plot_style import COMMAND, DISPLACEMENT, ERROR, MARK, QUIET, REFERENCE, STYLE
 from hilctl.models.base import HysteresisModel
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.butterfly import ButterflyModel
-from hilctl.models.duhem import DuhemModel
 from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve
 from hilctl.models.generalised_duhem import GeneralisedDuhemModel
-from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
-from hilctl.models.krasnoselskii import KrasnoselskiiPokrovskiiModel
+from hilctl.models.literature.bouc_wen import BoucWenModel
+from hilctl.models.literature.butterfly import ButterflyModel
+from hilctl.models.literature.duhem import DuhemModel
+from hilctl.models.literature.generalised_plays import GeneralisedModel, PlayEnvelope
+from hilctl.models.literature.krasnoselskii import KrasnoselskiiPokrovskiiModel
+from hilctl.models.literature.preisach import PreisachModel
 from hilctl.models.model_file import load_model
 from hilctl.models.plays import PpiModel, RdpiModel
-from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import FieldLag, FirstMode, StagedModel
 
 ROOT = Path(__file__).parents[1]

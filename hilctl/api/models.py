@@ -22,8 +22,8 @@ from hilctl.lab.identify.parallel import MapFunction, workers
 from hilctl.lab.identify.pipeline import Identification, identify_records, settings_from
 from hilctl.lab.identify.refinement import Refinement, refine_records
 from hilctl.lab.identify.settings import IdentifySettings
+from hilctl.lab.model_export.model_export import check_rate, export_text
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator
-from hilctl.models.model_export import check_rate, export_text
 from hilctl.models.model_file import dump_model
 from hilctl.models.model_file import load_model as read_model
 from hilctl.run.control.client import finish_dead_runs

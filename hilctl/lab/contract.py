@@ -27,9 +27,9 @@ from hilctl.lab.identify.fit_api import FitRequest
 from hilctl.lab.identify.fit_model import fit_model
 from hilctl.lab.identify.registry import HISTORIES, fit_named
 from hilctl.lab.identify.settings import FitSettings
+from hilctl.lab.model_export.model_export import export_text
 from hilctl.models import kinds
 from hilctl.models.base import HysteresisModel, Operator
-from hilctl.models.model_export import export_text
 from hilctl.models.model_file import dump_model, parse_model
 
 RATE_HZ = 50_000.0

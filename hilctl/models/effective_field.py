@@ -10,7 +10,12 @@ from hilctl.base.strict import CheckedModel, Field, StrictModel
 from hilctl.base.types import F64
 from hilctl.kernels.field import Bank, Losses, field_forward, field_inverse
 from hilctl.models.base import HysteresisModel, Operator, Thresholds, Weights
-from hilctl.models.preisach import cell_problems, line_problems, play_tables, table_problems
+from hilctl.models.literature.preisach import (
+    cell_problems,
+    line_problems,
+    play_tables,
+    table_problems,
+)
 
 _TOLERANCE_UM = 1e-6
 _EVEN = 1e-3

@@ -22,6 +22,7 @@ MODELS = "hilctl.models"
 """Group of subclasses of :class:`hilctl.models.base.HysteresisModel`, by their ``kind``."""
 FITS = "hilctl.fits"
 """Group of :class:`hilctl.lab.identify.registry.Fit`, which the laboratory loads."""
+_LITERATURE = "hilctl.models.literature"
 BUILTIN: Mapping[str, Mapping[str, str]] = {
     MODELS: {
         "ppi": "hilctl.models.plays:PpiModel",
@@ -29,12 +30,12 @@ BUILTIN: Mapping[str, Mapping[str, str]] = {
         "rdpi": "hilctl.models.plays:RdpiModel",
         "integrated": "hilctl.models.integrated:IntegratedModel",
         "staged": "hilctl.models.staged:StagedModel",
-        "butterfly": "hilctl.models.butterfly:ButterflyModel",
-        "generalised": "hilctl.models.generalised_plays:GeneralisedModel",
-        "preisach": "hilctl.models.preisach:PreisachModel",
-        "krasnoselskii_pokrovskii": "hilctl.models.krasnoselskii:KrasnoselskiiPokrovskiiModel",
-        "bouc_wen": "hilctl.models.bouc_wen:BoucWenModel",
-        "duhem": "hilctl.models.duhem:DuhemModel",
+        "butterfly": f"{_LITERATURE}.butterfly:ButterflyModel",
+        "generalised": f"{_LITERATURE}.generalised_plays:GeneralisedModel",
+        "preisach": f"{_LITERATURE}.preisach:PreisachModel",
+        "krasnoselskii_pokrovskii": f"{_LITERATURE}.krasnoselskii:KrasnoselskiiPokrovskiiModel",
+        "bouc_wen": f"{_LITERATURE}.bouc_wen:BoucWenModel",
+        "duhem": f"{_LITERATURE}.duhem:DuhemModel",
         "field": "hilctl.models.effective_field:FieldModel",
         "generalised_duhem": "hilctl.models.generalised_duhem:GeneralisedDuhemModel",
         "refined": "hilctl.models.refined:RefinedModel",

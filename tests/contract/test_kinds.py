@@ -24,9 +24,9 @@ from tests.unit.lab.identify.literature.test_literature import (
     GENERALISED,
     PREISACH,
 )
+from tests.unit.models.literature.test_implicit_models import KP
 from tests.unit.models.test_effective_field import ACTIVATION, field_model
 from tests.unit.models.test_generalised_duhem import duhem_model
-from tests.unit.models.test_implicit_models import KP
 from tests.unit.models.test_integrated import butterfly
 from tests.unit.models.test_refined import refined, residual
 from tests.unit.models.test_staged import OMEGA, STAGES

@@ -41,13 +41,13 @@ from hilctl.lab.identify.data.data_files import history_from_pieces
 from hilctl.lab.run_report.decimation import overview
 from hilctl.lab.run_report.run_page import page
 from hilctl.models.base import HysteresisModel
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
-from hilctl.models.krasnoselskii import KrasnoselskiiPokrovskiiModel
 from hilctl.models.linear_stages import FirstMode, FurtherMode
+from hilctl.models.literature.bouc_wen import BoucWenModel
+from hilctl.models.literature.generalised_plays import GeneralisedModel, PlayEnvelope
+from hilctl.models.literature.krasnoselskii import KrasnoselskiiPokrovskiiModel
+from hilctl.models.literature.preisach import PreisachModel
 from hilctl.models.model_file import dump_model
 from hilctl.models.plays import PpiModel
-from hilctl.models.preisach import PreisachModel
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording import reader, schema
 from hilctl.recording.reader import read

@@ -9,9 +9,9 @@ from hilctl.models.model_file import load_model
 from hilctl.models.staged import StagedModel
 from tests.fakes import FakeClock
 from tests.unit.loop.test_loop import CONFIGS, RATE_HZ, Rig
+from tests.unit.models.literature.test_implicit_models import BOUC_WEN, DUHEM, KP, PREISACH
 from tests.unit.models.test_base import MODELS as PLAYS
 from tests.unit.models.test_generalised_duhem import duhem_model
-from tests.unit.models.test_implicit_models import BOUC_WEN, DUHEM, KP, PREISACH
 
 COMPARED = {"preisach": PREISACH, "kp": KP, "bouc_wen": BOUC_WEN, "duhem": DUHEM}
 SHIPPED = {path.stem: load_model(path) for path in sorted(CONFIGS.glob("*.yaml"))}

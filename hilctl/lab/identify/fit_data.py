@@ -16,8 +16,8 @@ from hilctl.base.types import F64, F64_2D, CommandUnit, Mask
 from hilctl.kernels.hysteresis import play_outputs, play_sum_shared, rest_memory
 from hilctl.kernels.jit import kernel
 from hilctl.lab.identify.data.records import History, Record, Records, SteadyLoop
-from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.integrated import IntegratedModel
+from hilctl.models.literature.butterfly import ButterflyModel
 from hilctl.models.plays import PlayModel
 
 PERIODS = 3

@@ -8,8 +8,8 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import ModelError
 from hilctl.kernels.hysteresis import play_sum_shared, rest_memory
-from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel, exponential_integrated
+from hilctl.models.literature.butterfly import ButterflyModel
 from hilctl.models.plays import inverse_plays
 from tests.published import terfenol_rdpi
 from tests.unit.models.test_plays import DEADBAND, GOOD, broken

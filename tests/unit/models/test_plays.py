@@ -6,8 +6,8 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import ConfigError, ModelError
 from hilctl.models.base import HysteresisModel
-from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
+from hilctl.models.literature.generalised_plays import GeneralisedModel, PlayEnvelope
 from hilctl.models.model_file import parse_model
 from hilctl.models.plays import PpiModel, RdpiModel, SpiModel
 from tests.published import piezo_ppi

@@ -125,7 +125,7 @@ class Points:
 
 
 @dataclass(frozen=True, slots=True)
-class Phase:
+class SearchPhase:
     """Rows, limits and end of one phase of the search."""
 
     rows: int
@@ -138,11 +138,11 @@ class Phase:
 
 
 # The misfit of a coarse table is larger than the effect of some stages, so these are held firmly.
-COARSE = Phase(rows=4000, steps=18, gain=3e-2, held=1e-2, fades=True)
+COARSE = SearchPhase(rows=4000, steps=18, gain=3e-2, held=1e-2, fades=True)
 # Without a strong prior, first steps bring slopes that few loops reach to extreme values, from
 # which the search does not return.
 TABLE_ALONE = replace(COARSE, steps=3, gain=0.0, firm=3000.0, stages=False)
-FINE = Phase(rows=12_000, steps=8, gain=3e-3, held=3e-4)
+FINE = SearchPhase(rows=12_000, steps=8, gain=3e-3, held=3e-4)
 COARSE_CELLS = (12, 8)  # of the first table
 COARSE_TURN, FINE_TURN = 3e-3, 1e-3  # of the span: minimum return after a turn
 STEEPEST = 5.0  # logarithm of the largest slope, of the mean
@@ -189,7 +189,7 @@ class DuhemProblem:
         layout: Layout,
         first_um: float,
         bounds: Bounds,
-        phase: Phase,
+        phase: SearchPhase,
     ) -> None:
         self.layout = layout
         self._signals, self._points, self._first_um = signals, points, first_um

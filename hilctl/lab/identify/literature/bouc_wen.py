@@ -12,8 +12,8 @@ from hilctl.lab.identify.fit_api import FitJob, FoundModel
 from hilctl.lab.identify.least_squares import converged, first_least
 from hilctl.lab.identify.literature.weights import WEIGHTS_FOLLOW, ShapeSearch, weigh
 from hilctl.lab.identify.registry import ANY, Fit
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.implicit_models import NOTHING
+from hilctl.models.literature.bouc_wen import BoucWenModel
+from hilctl.models.literature.implicit_models import NOTHING
 
 _BETAS = (0.1, 0.3, 1.0, 3.0, 10.0)  # times the reach to the n
 _EVALUATIONS = 100

@@ -15,8 +15,8 @@ from hilctl.lab.identify.fit_api import FitJob, FoundModel
 from hilctl.lab.identify.least_squares import first_least
 from hilctl.lab.identify.literature.weights import WEIGHTS_FOLLOW
 from hilctl.lab.identify.registry import LOOPS, Fit
-from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.integrated import DeadbandFunction
+from hilctl.models.literature.butterfly import ButterflyModel
 
 _CORNERS = 16  # slopes of the even function
 _NEAR = 0.1  # of the stroke: distance to the turning point for a change of wing

@@ -4,7 +4,7 @@ from hilctl.lab.identify.fit_api import FitJob, FoundModel
 from hilctl.lab.identify.literature.bouc_wen import DifferentialLoop
 from hilctl.lab.identify.literature.weights import WEIGHTS_FOLLOW
 from hilctl.lab.identify.registry import ANY, Fit
-from hilctl.models.duhem import DuhemModel
+from hilctl.models.literature.duhem import DuhemModel
 
 
 def fit_duhem(job: FitJob) -> FoundModel:

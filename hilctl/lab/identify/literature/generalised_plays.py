@@ -9,7 +9,7 @@ from hilctl.lab.identify.fit_api import FitJob, FoundModel
 from hilctl.lab.identify.least_squares import converged, first_least
 from hilctl.lab.identify.literature.weights import WEIGHTS_FOLLOW, ShapeSearch, weigh
 from hilctl.lab.identify.registry import ANY, Fit
-from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
+from hilctl.models.literature.generalised_plays import GeneralisedModel, PlayEnvelope
 
 _SLOPES = (0.3, 0.7, 1.2)  # of the envelopes, times the reach
 _SHIFTS = (-0.6, 0.0, 0.6)

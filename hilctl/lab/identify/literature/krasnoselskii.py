@@ -7,7 +7,7 @@ from hilctl.lab.identify.fit_api import FitJob, FoundModel
 from hilctl.lab.identify.least_squares import numbered
 from hilctl.lab.identify.literature.weights import DENSITIES, STILL, largest_swing, smooth
 from hilctl.lab.identify.registry import ANY, Fit
-from hilctl.models.krasnoselskii import KrasnoselskiiPokrovskiiModel
+from hilctl.models.literature.krasnoselskii import KrasnoselskiiPokrovskiiModel
 
 LEVELS = 16
 

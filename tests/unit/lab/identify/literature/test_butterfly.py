@@ -8,8 +8,8 @@ from hilctl.lab.identify.data.records import History
 from hilctl.lab.identify.fit_api import FitRequest
 from hilctl.lab.identify.fit_model import FittedModel, fit_model
 from hilctl.lab.identify.settings import FitSettings
-from hilctl.models.butterfly import ButterflyModel
 from hilctl.models.integrated import DeadbandFunction
+from hilctl.models.literature.butterfly import ButterflyModel
 
 KNOWN = ButterflyModel(
     direct=0.5,

@@ -15,11 +15,11 @@ from hilctl.lab.identify.literature.preisach import fit_preisach
 from hilctl.lab.identify.literature.straight import fit_straight
 from hilctl.lab.identify.settings import FitSettings
 from hilctl.lab.identify.staged.staged_fits import fit_free
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.duhem import DuhemModel
-from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
 from hilctl.models.integrated import DeadbandFunction, IntegratedModel
-from hilctl.models.preisach import PreisachModel
+from hilctl.models.literature.bouc_wen import BoucWenModel
+from hilctl.models.literature.duhem import DuhemModel
+from hilctl.models.literature.generalised_plays import GeneralisedModel, PlayEnvelope
+from hilctl.models.literature.preisach import PreisachModel
 from tests.published import piezo_ppi
 
 RNG = np.random.default_rng(4)

@@ -10,8 +10,8 @@ import numpy as np
 
 from hilctl import __version__
 from hilctl.base.errors import InputError
+from hilctl.lab.model_export.kernel_translation import RESERVED, MatlabTranslator, Translator
 from hilctl.models.base import HysteresisModel, Operator
-from hilctl.models.kernel_translation import RESERVED, MatlabTranslator, Translator
 from hilctl.models.linear_stages import Chain
 from hilctl.models.model_file import model_sha256
 

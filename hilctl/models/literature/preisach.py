@@ -8,7 +8,7 @@ import numpy as np
 from hilctl.base.types import F64
 from hilctl.kernels.implicit_models import PREISACH
 from hilctl.models.base import Thresholds, Weights
-from hilctl.models.implicit_models import ImplicitModel, PackedParameters
+from hilctl.models.literature.implicit_models import ImplicitModel, PackedParameters
 
 
 class PreisachModel(ImplicitModel):

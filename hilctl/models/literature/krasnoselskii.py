@@ -7,7 +7,7 @@ import numpy as np
 
 from hilctl.kernels.implicit_models import KRASNOSELSKII_POKROVSKII
 from hilctl.models.base import Weights
-from hilctl.models.implicit_models import ImplicitModel, PackedParameters
+from hilctl.models.literature.implicit_models import ImplicitModel, PackedParameters
 
 
 class KrasnoselskiiPokrovskiiModel(ImplicitModel):

@@ -6,7 +6,7 @@ import pytest
 
 from hilctl.base.errors import ModelError
 from hilctl.base.types import F64
-from hilctl.models.kernel_translation import MatlabTranslator, Translator
+from hilctl.lab.model_export.kernel_translation import MatlabTranslator, Translator
 
 BOTH = pytest.mark.parametrize("translator", [Translator, MatlabTranslator])
 

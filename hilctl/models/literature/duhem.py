@@ -6,7 +6,7 @@ from typing import Literal
 import numpy as np
 
 from hilctl.kernels.implicit_models import BOUC_WEN
-from hilctl.models.implicit_models import NOTHING, ImplicitModel, PackedParameters
+from hilctl.models.literature.implicit_models import NOTHING, ImplicitModel, PackedParameters
 
 
 class DuhemModel(ImplicitModel):

@@ -16,7 +16,7 @@ from hilctl.models.base import (
     play_weight_problems,
     threshold_problems,
 )
-from hilctl.models.implicit_models import BoundedInputModel
+from hilctl.models.literature.implicit_models import BoundedInputModel
 from hilctl.models.plays import inverse_plays
 
 

@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.models.model_export import export_text
+from hilctl.lab.model_export.model_export import export_text
 from tests.published import piezo_ppi
 
 

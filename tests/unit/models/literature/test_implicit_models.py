@@ -10,12 +10,12 @@ from hypothesis.extra import numpy as hnp
 from pydantic import ValidationError
 from scipy.integrate import solve_ivp
 
-from hilctl.models.bouc_wen import BoucWenModel
-from hilctl.models.duhem import DuhemModel
-from hilctl.models.generalised_plays import GeneralisedModel, PlayEnvelope
-from hilctl.models.implicit_models import TOLERANCE_UM
-from hilctl.models.krasnoselskii import KrasnoselskiiPokrovskiiModel
-from hilctl.models.preisach import PreisachModel
+from hilctl.models.literature.bouc_wen import BoucWenModel
+from hilctl.models.literature.duhem import DuhemModel
+from hilctl.models.literature.generalised_plays import GeneralisedModel, PlayEnvelope
+from hilctl.models.literature.implicit_models import TOLERANCE_UM
+from hilctl.models.literature.krasnoselskii import KrasnoselskiiPokrovskiiModel
+from hilctl.models.literature.preisach import PreisachModel
 
 RATE_HZ = 50_000.0
 LOW, HIGH = SPAN = (-7.0, 8.0)

@@ -1,0 +1,1 @@
+"""Kinds of model of the literature, for comparison."""
