@@ -24,8 +24,8 @@ from hilctl.lab.identify.field.duhem_search import (
     DuhemEnd,
     DuhemProblem,
     DuhemSearch,
-    Phase,
     Points,
+    SearchPhase,
     Signals,
     _bounded_step,
 )
@@ -203,7 +203,7 @@ def ready(unit: float = 1.0, um: float = 1.0, steps: int = 3) -> tuple[DuhemProb
     points = Points(signals, FIRST, 1e-3)
     here = laid_over(points.paths(FIRST), 8, 6)
     bounds = Bounds(LOWEST, HIGHEST, FIRST, (float(np.log(0.05 * um / unit)), 10.0))
-    phase = Phase(rows=500, steps=steps, gain=0.0, held=1e-2)
+    phase = SearchPhase(rows=500, steps=steps, gain=0.0, held=1e-2)
     return DuhemProblem(signals, points, here, 0.7 * um, bounds, phase), here.first_logs()
 
 
