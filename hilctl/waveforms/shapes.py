@@ -144,15 +144,15 @@ def _shape(w: spec.ShapeOfTime, at: _Instants) -> F64:
     match w:
         case spec.Sine():
             return w.amplitude * _sine(w.frequency_hz, math.radians(w.phase_deg), at)
-        case spec.Triangle():  # starts at 0 and rises
-            phase = np.mod(at.cycles(w.frequency_hz) + 0.25, 1.0)
-            return w.amplitude * (1.0 - 4.0 * np.abs(phase - 0.5))
+        case spec.Triangle():
+            return _triangle(w, at)
         case spec.ComplexHarmonic():
             return _complex_harmonic(w, at)
         case spec.GrowingOrDecaying():
             elapsed = at.t / w.duration_s
             envelope = elapsed if w.kind == "growing" else 1.0 - elapsed
-            return w.amplitude * envelope * _sine(w.frequency_hz, 0.0, at)
+            angle = math.radians(w.phase_deg)
+            return w.amplitude * envelope * _sine(w.frequency_hz, angle, at)
         case spec.Chirp():
             return _chirp(w, at.t)
         case spec.Multisine():
@@ -167,6 +167,15 @@ def _shape(w: spec.ShapeOfTime, at: _Instants) -> F64:
 
 def _sine(frequency_hz: float, angle: float, at: _Instants) -> F64:
     return np.sin(2.0 * np.pi * at.cycles(frequency_hz) + angle)
+
+
+def _triangle(w: spec.Triangle, at: _Instants) -> F64:
+    """Return a triangle that rises in its share of each period: float64[n]."""
+    # Phase 0 is in the middle of the rise, and 0 here is the lowest point.
+    cycles = np.mod(at.cycles(w.frequency_hz) + (w.phase_deg / 360.0 + 0.5 * w.rise), 1.0)
+    after = cycles - w.rise
+    values: F64 = 1.0 - 2.0 * np.where(after < 0.0, -after / w.rise, after / (1.0 - w.rise))
+    return w.amplitude * values
 
 
 def _complex_harmonic(w: spec.ComplexHarmonic, at: _Instants) -> F64:

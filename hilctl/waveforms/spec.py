@@ -79,11 +79,13 @@ class Sine(_Shape):
 
 
 class Triangle(_Shape):
-    """A triangle that starts at its offset and rises."""
+    """A triangle that starts at its offset and rises, at phase 0."""
 
     kind: Literal["triangle"]
     amplitude: Amplitude
     frequency_hz: Frequency
+    phase_deg: Phase = 0.0
+    rise: float = Field(default=0.5, gt=0.0, lt=1.0, description="share of the period that rises")
     duration_s: Duration
 
 
@@ -111,6 +113,7 @@ class GrowingOrDecaying(_Shape):
     kind: Literal["growing", "decaying"]
     amplitude: Amplitude
     frequency_hz: Frequency
+    phase_deg: Phase = 0.0
     duration_s: Duration
 
 

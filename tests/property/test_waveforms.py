@@ -29,17 +29,17 @@ def keys(kind: str, **own: st.SearchStrategy[Any]) -> st.SearchStrategy[Keys]:
     )
 
 
-def sine_like(kind: str) -> st.SearchStrategy[Keys]:
-    return keys(kind, amplitude=amplitudes, frequency_hz=frequencies_hz, duration_s=durations_s)
+phases_deg = st.floats(-360.0, 360.0)
+
+
+def sine_like(kind: str, **own: st.SearchStrategy[Any]) -> st.SearchStrategy[Keys]:
+    own |= {"amplitude": amplitudes, "frequency_hz": frequencies_hz, "phase_deg": phases_deg}
+    return keys(kind, duration_s=durations_s, **own)
 
 
 harmonics = st.lists(
     st.fixed_dictionaries(
-        {
-            "amplitude": amplitudes,
-            "frequency_hz": frequencies_hz,
-            "phase_deg": st.floats(-360.0, 360.0),
-        }
+        {"amplitude": amplitudes, "frequency_hz": frequencies_hz, "phase_deg": phases_deg}
     ),
     min_size=1,
     max_size=5,
@@ -88,7 +88,7 @@ def softened(draw: st.DrawFn, waveforms: st.SearchStrategy[Keys]) -> Keys:
 singles = softened(
     st.one_of(
         sine_like("sine"),
-        sine_like("triangle"),
+        sine_like("triangle", rise=st.floats(0.01, 0.99)),
         sine_like("growing"),
         sine_like("decaying"),
         keys("complex_harmonic", components=harmonics, duration_s=durations_s),

@@ -78,6 +78,8 @@ class TestSequence:
 LABELS: list[tuple[dict[str, Any], str, float]] = [
     ({**SINE, "duration_s": 1.0}, "sine 6 A 10 Hz", 100.0),
     ({**SINE, "kind": "triangle", "duration_s": 1.0}, "triangle 6 A 10 Hz", 100.0),
+    ({**SINE, "kind": "triangle", "rise": 0.9, "phase_deg": 162.0, "duration_s": 1.0},
+     "triangle 6 A 10 Hz", 100.0),
     ({**SINE, "frequency_hz": 3.0, "duration_s": 1.0}, "sine 6 A 3 Hz", 1000.0 / 3.0),
     ({**SINE, "kind": "growing", "duration_s": 1.0}, "growing 6 A 10 Hz", 0.0),
     ({**SINE, "kind": "decaying", "duration_s": 1.0}, "decaying 6 A 10 Hz", 0.0),
@@ -179,10 +181,11 @@ def test_unit_is_needed() -> None:
 SOFT = {"soft_start_s": 0.31, "soft_end_s": 0.17, "rest": -0.5, "offset": 0.25}
 WAVES: list[dict[str, Any]] = [
     {"kind": "sine", "amplitude": 6.0, "frequency_hz": 7.3, "duration_s": 4.0},
-    {"kind": "triangle", "amplitude": 6.0, "frequency_hz": 7.3, "duration_s": 4.0},
+    {"kind": "triangle", "amplitude": 6.0, "frequency_hz": 7.3, "rise": 0.8, "duration_s": 4.0},
     {"kind": "complex_harmonic", "components": ({"amplitude": 1.0, "frequency_hz": 3.0},
      {"amplitude": 2.0, "frequency_hz": 4.0, "phase_deg": 20.0}, ), "duration_s": 4.0},
-    {"kind": "growing", "amplitude": 6.0, "frequency_hz": 7.3, "duration_s": 4.0},
+    {"kind": "growing", "amplitude": 6.0, "frequency_hz": 7.3, "phase_deg": 90.0,
+     "duration_s": 4.0},
     {"kind": "chirp", "amplitude": 6.0, "start_hz": 1.0, "stop_hz": 90.0, "duration_s": 4.0},
     {"kind": "step", "levels": (1.0, -2.0, 3.0), "dwell_s": 1.3, "rise_s": 0.1},
     {"kind": "hold", "level": 2.0, "duration_s": 4.0},
@@ -308,6 +311,17 @@ class TestText:
         assert soft.values[-1] == 0.0
         np.testing.assert_array_equal(soft.values[50:150], 5.0 + WAVE[50:150])
         assert (soft.segments[0].steady_start, soft.segments[0].steady_stop) == (50, 150)
+
+    def test_axes_from_columns_of_one_file(self, read: Read) -> None:
+        """The columns have the same start and length, also at another rate."""
+        text = "t_s,x,y\n" + rows(T_S * 0.7, WAVE, -WAVE)
+        for resample in ("linear", "cubic"):
+            x, y = (read(text, column=name, resample=resample, soft_start_s=0.01) for name in "xy")
+            np.testing.assert_allclose(y.values, -x.values, rtol=0.0, atol=1e-12)
+            assert (x.values.size, x.segments) == (140, y.segments)
+        ragged = text.rsplit(",", 1)[0] + ",\n"
+        assert read(ragged, column="x", resample="linear").values.size == 140
+        assert "must be a finite number" in refusal(read, ragged, column="y", resample="linear")
 
     def test_period_makes_steady_cycles(self, read: Read) -> None:
         segment = read(rows(WAVE), file_rate_hz=RATE_HZ, period_s=0.1).segments[0]

@@ -21,11 +21,9 @@ def sampled(value: Callable[[float], float], n: int, rate_hz: float = RATE_HZ) -
     return np.array([value(k / rate_hz) for k in range(n)])
 
 
-def triangle_wave(cycles: float) -> float:
-    part = cycles % 1.0
-    if part < 0.25:
-        return 4.0 * part
-    return 2.0 - 4.0 * part if part < 0.75 else 4.0 * part - 4.0
+def triangle_wave(cycles: float, rise: float = 0.5) -> float:
+    corners = (0.0, 0.5 * rise, 1.0 - 0.5 * rise, 1.0)
+    return float(np.interp(cycles % 1.0, corners, (0.0, 1.0, -1.0, 0.0)))
 
 
 CASES: list[tuple[dict[str, Any], Callable[[float], float]]] = [
@@ -36,6 +34,11 @@ CASES: list[tuple[dict[str, Any], Callable[[float], float]]] = [
      lambda t: -7.25 + 2.0 * math.sin(2 * math.pi * 100 * t - math.pi / 6)),
     ({"kind": "triangle", "amplitude": 3.0, "frequency_hz": 7.0, "offset": 1.0, "duration_s": 0.4},
      lambda t: 1.0 + 3.0 * triangle_wave(7.0 * t)),
+    ({"kind": "triangle", "amplitude": 3.0, "frequency_hz": 7.0, "rise": 0.9, "duration_s": 0.4},
+     lambda t: 3.0 * triangle_wave(7.0 * t, 0.9)),
+    ({"kind": "triangle", "amplitude": 3.0, "frequency_hz": 7.0, "rise": 0.2, "phase_deg": -90.0,
+      "offset": 1.0, "duration_s": 0.4},
+     lambda t: 1.0 + 3.0 * triangle_wave(7.0 * t - 0.25, 0.2)),
     ({"kind": "complex_harmonic", "duration_s": 0.2, "components": (
         {"amplitude": 4.0, "frequency_hz": 20.0},
         {"amplitude": 3.0, "frequency_hz": 60.0, "phase_deg": 90.0})},
@@ -44,6 +47,8 @@ CASES: list[tuple[dict[str, Any], Callable[[float], float]]] = [
      lambda t: 7.0 * t * math.sin(2 * math.pi * 10 * t)),
     ({"kind": "decaying", "amplitude": 7.0, "frequency_hz": 10.0, "duration_s": 2.0},
      lambda t: 7.0 * (1 - t / 2.0) * math.sin(2 * math.pi * 10 * t)),
+    ({"kind": "growing", "amplitude": 7.0, "frequency_hz": 10.0, "phase_deg": 90.0,
+      "duration_s": 1.0}, lambda t: 7.0 * t * math.cos(2 * math.pi * 10 * t)),
     ({"kind": "chirp", "amplitude": 2.0, "start_hz": 5.0, "stop_hz": 45.0, "duration_s": 0.8},
      lambda t: 2.0 * math.sin(2 * math.pi * (5.0 * t + 25.0 * t * t))),
     ({"kind": "chirp", "amplitude": 2.0, "start_hz": 45.0, "stop_hz": 5.0, "duration_s": 0.8},
@@ -71,6 +76,35 @@ def test_closed_form(
     np.testing.assert_allclose(reference.values, sampled(closed_form, n), rtol=0.0, atol=1e-11)
     assert reference.unit == "A"
     assert reference.sample_rate_hz == RATE_HZ
+
+
+@pytest.mark.parametrize("rise", [1e-300, 1e-3, 0.5, 0.999, 1.0 - 2.0**-53])
+@pytest.mark.parametrize("phase_deg", [0.0, 720.0, -1e-15])
+def test_triangle_starts_at_its_offset_within_its_range(
+    made: Made, rise: float, phase_deg: float
+) -> None:
+    keys = {"amplitude": 3.0, "frequency_hz": 7.0, "duration_s": 1.0, "offset": 2.0}
+    values = made(RATE_HZ, kind="triangle", rise=rise, phase_deg=phase_deg, **keys).values
+    assert np.max(np.abs(values - 2.0)) <= 3.0
+    if rise > 1e-3:
+        assert values[0] == pytest.approx(2.0, abs=1e-9)
+        assert values[1] > values[0]
+
+
+@pytest.mark.parametrize("frequency_hz", [10.0, 30.0])
+def test_raster_steps_once_per_line_in_the_flyback(made: Made, frequency_hz: float) -> None:
+    """A triangle that begins with its flyback, and a step per period that ends within it."""
+    lines, rate_hz, period_s = 256, 10_000.0, 1.0 / frequency_hz
+    x = made(rate_hz, kind="triangle", amplitude=40.0, frequency_hz=frequency_hz, rise=0.9,
+             phase_deg=162.0, duration_s=lines * period_s)  # fmt: skip
+    y = made(rate_hz, kind="step", levels=tuple(range(1, lines + 1)), dwell_s=period_s,
+             rise_s=0.08 * period_s)  # fmt: skip
+    assert x.values.size == y.values.size
+    line = np.floor(np.arange(x.values.size) / rate_hz * frequency_hz + 1e-9)
+    assert line[-1] == lines - 1
+    scanning = np.append(np.diff(x.values), 1.0) > 0.0
+    np.testing.assert_array_equal(y.values[scanning], 1.0 + line[scanning])
+    assert np.bincount(line[scanning].astype(int)).min() > 0.9 * rate_hz * period_s - 2.0
 
 
 class TestStep:
@@ -248,16 +282,20 @@ def test_values_are_read_only(made: Made) -> None:
     ("frequency_hz", "rate_hz", "period"),
     [(100.0, 50_000.0, 500), (0.1, 50_000.0, 500_000), (33.3, 1000.0, 10_000), (7.0, 48_000.1, 0)],
 )
-@pytest.mark.parametrize("kind", ["sine", "triangle", "multisine"])
+@pytest.mark.parametrize("kind", ["sine", "triangle", "sawtooth", "multisine"])
 def test_cycles_are_the_same_bit_for_bit(kind, frequency_hz, rate_hz, period):
-    common = {"amplitude": 3.0, "duration_s": (2 * period + 700) / rate_hz, "unit": "um"}
+    common: dict[str, Any] = {"amplitude": 3.0, "unit": "um"}
+    common["duration_s"] = (2 * period + 700) / rate_hz
     shape: spec.Sine | spec.Triangle | spec.Multisine
     if kind == "multisine":
         band = {"first_hz": frequency_hz, "last_hz": 2.5 * frequency_hz, "step_hz": frequency_hz}
         shape = spec.Multisine(kind=kind, **band, **common)
     else:
-        shape = {"sine": spec.Sine, "triangle": spec.Triangle}[kind](
-            kind=kind, frequency_hz=frequency_hz, **common
+        common |= {"frequency_hz": frequency_hz, "phase_deg": 0.0 if kind == "sine" else 30.0}
+        shape = (
+            spec.Sine(kind="sine", **common)
+            if kind == "sine"
+            else spec.Triangle(kind="triangle", rise=0.5 if kind == "triangle" else 0.9, **common)
         )
     values = shapes.sampled(shape, rate_hz)
     turn = Fraction(repr(frequency_hz)) / Fraction(repr(rate_hz))

@@ -27,6 +27,7 @@ def problems(waveform: str) -> list[tuple[str, str]]:
 
 
 MULTISINE = "kind: multisine, unit: A, amplitude: 1, duration_s: 1"
+TRIANGLE = "kind: triangle, unit: A, amplitude: 1, frequency_hz: 10, duration_s: 1"
 RANDOM = "kind: random, unit: A, amplitude: 1.0"
 
 
@@ -36,6 +37,8 @@ RANDOM = "kind: random, unit: A, amplitude: 1.0"
     ("kind: hold, level: 1.0, duration_s: 1.0", 4, ".unit"),
     ("kind: hold, level: 1.0, duration_s: 1.0, unit: V", 8, ".unit"),
     ("kind: step, unit: A, levels: [1], dwell_s: 1, rise_s: 2", 9, ".rise_s"),
+    (f"{TRIANGLE}, rise: 0", 10, ".rise"),
+    (f"{TRIANGLE}, rise: 1.0", 10, ".rise"),
     ("kind: step, unit: A, levels: [], dwell_s: 1", 7, ".levels"),
     ("kind: step, unit: A, levels: [a, 2.0], dwell_s: 1", 7, ".levels.0"),
     ("kind: step, unit: A, levels: [a], dwell_s: 1", 7, ".levels.0"),
