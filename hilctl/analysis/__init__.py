@@ -1,7 +1,7 @@
 """Metrics, reports, replays, exports and the catalogue of recordings."""
 
 PUBLIC = (
-    "catalogue", "export", "export_files", "replay", "report", "run_metrics", "steady_state",
-    "tick_lateness",
+    "catalogue", "contour", "export", "export_files", "replay", "report", "run_metrics",
+    "steady_state", "tick_lateness",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

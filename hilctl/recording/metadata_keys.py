@@ -24,6 +24,11 @@ END_FIGURES = (
 AUX_FACT = "aux"
 """Fact of a run: its auxiliary channels, a JSON list of objects with name, unit and meaning. Facts
 of its end begin with it: ``aux.NAME.min`` and ``aux.NAME.max``, the range of each channel."""
+AXIS_FACT = "axis"
+"""Fact of a run of several axes: name of the recorded axis."""
+AXES_FACT = "axes"
+"""Fact of a run of several axes: JSON list of the names of all, the fast axis first. Their
+recordings have one ``run_id``."""
 USAGE_FACT = "processes"
 """Fact of the end of a run: resource usage of ``loop`` and ``supervisor``, as JSON objects."""
 OVERRIDES_FACT = "overrides"
