@@ -91,14 +91,6 @@ class Dac(DacDevice):
             details["reader_link"] = reader.profile.link.model_dump_json()
         position = f" in {setup.input.unit}" if setup.input.per_unit("um") else ""
         description += f"{':' if setup.reads_elsewhere else ','} {options.input}{position}"
-        watchdog: dict[str, Any] = {}
-        if options.watchdog != "none":
-            watchdog = {
-                "watchdog_command": options.watchdog.safe_command,
-                "watchdog_timeout_s": options.watchdog.timeout_s,
-                "watchdog_reason": options.watchdog.reason,
-                "arm_s": wire.watchdog.arm_s,
-            }
         unit = "" if writer.unit is None else f"unit {writer.unit}, "
         return DeviceInfo(
             name=self.KIND,
@@ -129,8 +121,19 @@ class Dac(DacDevice):
             digital_output=options.digital_output or "",
             digital_output_s=0.0 if (pulse := setup.digital_time) is None else pulse.total_s,
             digital_input=options.digital_input or "",
-            **watchdog,
+            **self._describe_watchdog(),
         )
+
+    def _describe_watchdog(self) -> dict[str, Any]:
+        watchdog = self._options.watchdog
+        if watchdog == "none":
+            return {}
+        return {
+            "watchdog_command": watchdog.safe_command,
+            "watchdog_timeout_s": watchdog.timeout_s,
+            "watchdog_reason": watchdog.reason,
+            "arm_s": self._wire.watchdog.arm_s,
+        }
 
     def _late_note(self) -> str:
         message_s = self._wire.longest_message_s

@@ -504,6 +504,13 @@ def check_watchdog(
         raise InputError(
             f"watchdog.safe_command must be {low:g} to {high:g}, got {wanted.safe_command:g}"
         )
+    _check_trip(title, name, output, chain, has, wanted.safe_command)
+
+
+def _check_trip(
+    title: str, name: str, output: Range, chain: SignalChain, has: Watchdog, safe_command: float
+) -> None:
+    """Reject a watchdog that would not set an output to the safe command."""
     safe = getattr(has, "safe", {})
     if has.on_trip == "hold":
         raise InputError(
@@ -516,8 +523,8 @@ def check_watchdog(
             f"{', '.join(safe)}: take one of these, or say watchdog: none"
         )
     at_zero, unit = chain.command(0.0), chain.command_unit
-    if has.on_trip in {"zero", "reset"} and abs(at_zero - wanted.safe_command) > 1e-9:
+    if has.on_trip in {"zero", "reset"} and abs(at_zero - safe_command) > 1e-9:
         raise InputError(
             f"the watchdog of {title} puts {name} at 0 {output.unit}, which is {at_zero:g} "
-            f"{unit} here: watchdog.safe_command must be that, got {wanted.safe_command:g}"
+            f"{unit} here: set watchdog.safe_command to {at_zero:g}, got {safe_command:g}"
         )

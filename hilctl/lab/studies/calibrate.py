@@ -21,11 +21,12 @@ from hilctl.base.files import check_writable, exists, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.strict import ValidationError, first_problem
 from hilctl.base.table import Column, Table, open_table
-from hilctl.base.types import F64, I64
+from hilctl.base.types import F64, I64, CommandUnit
 from hilctl.base.yaml import dump, load_document, setting
 from hilctl.experiment.load import load_experiment
 from hilctl.lab.studies.characterise.characterisation_runner import without_reference
 from hilctl.lab.studies.study import Study, StudyStep
+from hilctl.recording.recording import Recording
 from hilctl.signals.cycle_metrics import rms
 
 _HIGHEST_ORDER = 4
@@ -249,16 +250,33 @@ def measure_amplifier(
     steps = {"kind": "step", "unit": unit, "levels": levels.tolist(), "rest": safe}
     times = {"dwell_s": dwell / rate_hz, "rise_s": 0.5 * dwell / rate_hz}
     run = yield StudyStep(experiment, [*settings, setting("waveform", steps | times)], name)
-    recorded = run.recording
+    command, measured = _settled_means(run.recording, dwell, levels.size)
+    return _amplifier_fit(run.path, command, measured, (low, high), unit, origin)
+
+
+def _settled_means(recorded: Recording, dwell: int, levels: int) -> tuple[F64, F64]:
+    """Return the mean command and its read-back at the end of each step: float64[levels] each."""
     start = recorded.segments[0].start
-    samples = recorded.samples.part(start, start + dwell * levels.size)
+    samples = recorded.samples.part(start, start + dwell * levels)
     settled = (samples.index - start) % dwell >= 0.6 * dwell
     step = (samples.index[settled] - start) // dwell
-    count = np.maximum(np.bincount(step, minlength=levels.size), 1)
+    count = np.maximum(np.bincount(step, minlength=levels), 1)
     command, measured = (
-        np.bincount(step, values[settled], levels.size) / count
+        np.bincount(step, values[settled], levels) / count
         for values in (samples.command, samples.measured)
     )
+    return command, measured
+
+
+def _amplifier_fit(
+    path: Path,
+    command: F64,
+    measured: F64,
+    span: tuple[float, float],
+    unit: CommandUnit,
+    origin: Origin,
+) -> CalibrationFit:
+    """Fit gain and offset of a read-back; raise RunError if it does not follow the command."""
     centred = command - command.mean()
     gain = float(centred @ measured / (centred @ centred))
     offset = float(measured.mean() - gain * command.mean())
@@ -267,16 +285,16 @@ def measure_amplifier(
         fitted = AmplifierCalibration(
             **origin._asdict(),
             unit=unit,
-            range=(low, high),
+            range=span,
             gain=gain,
             offset=offset,
-            residual_rms=float(np.sqrt(np.sum(residuals**2) / (levels.size - 2))),
+            residual_rms=float(np.sqrt(np.sum(residuals**2) / (command.size - 2))),
             residual_max=float(np.abs(residuals).max()),
         )
     except ValidationError:
         line = f"{gain:.3g} * command {offset:+.3g} {unit}"
         hint = "Check device.amplifier, device.measure and their wiring"
-        raise RunError(f"{run.path}: the read-back is not the command: {line}. {hint}") from None
+        raise RunError(f"{path}: the read-back is not the command: {line}. {hint}") from None
     return CalibrationFit(fitted, command, measured, residuals)
 
 

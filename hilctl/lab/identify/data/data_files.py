@@ -204,13 +204,17 @@ def load_records(
             chosen = kept if left_out else ()
             records += loops_from_pieces(chain([first], pieces), settings.points, chosen)
     if len(units) > 1:
-        raise InputError("recordings with commands in A and in V can't be fitted together")
-    for label in left_out:
-        if not any(each.startswith(label) for each in known):
-            raise InputError(f"--leave-out {label!r}: unknown label; known are {', '.join(known)}")
+        raise InputError("recordings with commands in A and in V cannot be fitted together")
+    _check_left_out(left_out, known)
     if known and not records:
         raise InputError("--leave-out excludes all records")
     return LoadedRecords(records, next(iter(units), None), understood)
+
+
+def _check_left_out(left_out: Iterable[str], known: Sequence[str]) -> None:
+    for label in left_out:
+        if not any(each.startswith(label) for each in known):
+            raise InputError(f"--leave-out {label!r}: unknown label; known are {', '.join(known)}")
 
 
 def _from_table(path: Path, settings: IdentifySettings, lag_samples: int) -> TableRecord:
