@@ -27,7 +27,7 @@ import numpy.typing as npt
 from hilctl.analysis.report import Windows, build_report
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import DataError
-from hilctl.base.formatting import finite, shown_briefly
+from hilctl.base.formatting import finite, printable, quantity, shown_briefly
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
 from hilctl.base.types import F64, I64
 from hilctl.kernels.path import nearest_on_path
@@ -100,6 +100,46 @@ class ContourReport(ContourMetrics):
         """Return plain values for JSON; numbers that are not finite become None."""
         mapping: dict[str, Any] = finite(asdict(self))
         return mapping
+
+
+def contour_rows(report: ContourReport) -> list[tuple[str, str]]:
+    """Return name and value of the errors of a run."""
+    um = partial(quantity, unit="um")
+    along = f"{um(report.along_mean_um)} mean, {um(report.along_rms_um)} rms"
+    limited = f"{report.limited_samples:,} of {report.samples:,}: their lag may be longer"
+    known = [
+        ("contour error", f"{um(report.peak_um)} peak, {um(report.rms_um)} rms, "
+         f"{um(report.mean_um)} mean"),
+        ("along the path", f"{along}, {um(report.along_peak_um)} peak"),
+        ("lag", quantity(report.lag_s, "s")),
+        *([("at the end of the window", limited)] if report.limited_samples else []),
+    ]  # fmt: skip
+    first, *_ = report.axes
+    return [
+        *(known if report.samples else []),
+        *(
+            (f"skew of {name}", f"{quantity(each['mean'], 'us')} mean, "
+             f"{quantity(each['max'], 'us')} max after {first}")
+            for name, each in report.skew_us.items()
+            if each["max"]  # otherwise the run did not keep real time
+        ),
+        ("evaluated samples", f"{report.samples:,}"),
+    ]  # fmt: skip
+
+
+def contour_table(report: ContourReport) -> tuple[list[str], list[list[str]]]:
+    """Return headings and rows of all segments."""
+    headings = ["segment", "start s", "peak µm", "rms µm", "mean µm", "lag ms", "window ms"]
+    return headings, [
+        [
+            "; ".join(map(printable, each.labels)),
+            f"{each.start_s:g}",
+            *map(quantity, (each.peak_um, each.rms_um, each.mean_um)),
+            quantity(None if each.lag_s is None else 1e3 * each.lag_s),
+            quantity(1e3 * each.window_s),
+        ]
+        for each in report.segments
+    ]
 
 
 @dataclass(frozen=True, slots=True)

@@ -37,7 +37,7 @@ if TYPE_CHECKING:
     from hilctl.api.connection import RunConnection, connect
     from hilctl.api.models import LoadedModel, compare, export_model, identify, load_model, refine
     from hilctl.api.recordings import RecordedRun, export, list_runs, read, replay, summarize
-    from hilctl.api.reports import figures, report_page, report_runs
+    from hilctl.api.reports import contour, figures, report_page, report_runs
     from hilctl.api.responses import frf, spectrum, step, tune
     from hilctl.api.runs import WrittenExperiment, check, init, load, run
     from hilctl.api.studies import StepFaultError, StepStoppedError, StudyRun, StudyStep, study
@@ -48,7 +48,7 @@ __all__ = [
     "ModelError", "RecordedRun", "RunConnection", "RunError", "RunTable", "SampleTable",
     "StepFaultError", "StepStoppedError", "StudyRun", "StudyStep", "WrittenExperiment",
     "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise", "check", "compare",
-    "connect", "export", "export_model", "figures", "frf", "identify", "init",
+    "connect", "contour", "export", "export_model", "figures", "frf", "identify", "init",
     "learn", "list_runs", "load", "load_model", "read", "refine", "replay", "report_page",
     "report_runs", "run", "spectrum", "step", "study", "summarize", "tune",
 ]  # fmt: skip
@@ -66,7 +66,7 @@ if not TYPE_CHECKING:
         },
         "connection": {"RunConnection", "connect"},
         "models": {"LoadedModel", "compare", "export_model", "identify", "load_model", "refine"},
-        "reports": {"figures", "report_page", "report_runs"},
+        "reports": {"contour", "figures", "report_page", "report_runs"},
         "responses": {"frf", "spectrum", "step", "tune"},
         "runs": {"WrittenExperiment", "check", "init", "load", "run"},
         "studies": {"StepFaultError", "StepStoppedError", "StudyRun", "StudyStep", "study"},

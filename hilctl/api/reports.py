@@ -6,12 +6,15 @@ from typing import Literal
 
 from matplotlib.axes import Axes
 
+from hilctl.analysis.contour import ContourReport, recordings_by_axis
+from hilctl.analysis.contour import contour as contour_of
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.api._types import PathLike, Paths, paths_of
 from hilctl.api.recordings import stream_of
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_writable, is_folder, write_text
 from hilctl.lab.pages.figure_layout import FigureSpec, formats_of
+from hilctl.lab.run_report.contour_page import contour_page
 from hilctl.lab.run_report.decimation import overview
 from hilctl.lab.run_report.run_page import page, run_sheets
 from hilctl.lab.studies.multi_run.collect import RunSeries, collect
@@ -49,6 +52,44 @@ def report_page(
     summary, shown = overview(stream_of(run, from_s, to_s))
     write_text(Path(html), page(shown, summary, earlier), overwrite=True)
     return summary
+
+
+def contour(
+    runs: Paths,
+    html: PathLike | None = None,
+    *,
+    from_s: float | None = None,
+    to_s: float | None = None,
+    overwrite: bool = False,
+) -> ContourReport:
+    """Return the contour error of a run of several axes and the metrics of each axis.
+
+    Args:
+        runs: Recordings of the run, one per axis; the others of a single one are found in its
+            folder. They are read in pieces and may be larger than memory.
+        html: Page to write, if any.
+        from_s: Start of the time range to evaluate.
+        to_s: End of the time range.
+        overwrite: Replace an existing page.
+
+    Raises:
+        InputError: The recordings are not those of one run of several axes, or the page cannot be
+            written.
+        DataError: A file is not a recording.
+    """
+    if html is not None:
+        check_writable(Path(html), overwrite=overwrite)
+    finish_dead_runs()
+    paths = paths_of(runs)
+    if not (found := recordings_by_axis(paths)):
+        text = ", ".join(map(str, paths))
+        raise InputError(f"{text}: must be recordings of the axes of one run, at least two")
+    streams = {name: stream_of(path, from_s, to_s) for name, path in found.items()}
+    report, traces = contour_of(streams)
+    if html is not None:
+        shown = {name: overview(stream)[1] for name, stream in streams.items()}
+        write_text(Path(html), contour_page(report, traces, shown), overwrite=True)
+    return report
 
 
 def report_runs(

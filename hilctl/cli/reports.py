@@ -10,6 +10,12 @@ from rich.table import Table
 from rich.text import Text
 
 from hilctl import api
+from hilctl.analysis.contour import (
+    ContourReport,
+    contour_rows,
+    contour_table,
+    recordings_by_axis,
+)
 from hilctl.analysis.run_metrics import RunReport, quality_rows, run_rows, segment_table
 from hilctl.base.errors import InputError
 from hilctl.base.files import is_folder
@@ -63,6 +69,13 @@ def report(
     as_json: AsJson = False,
 ) -> None:
     """Evaluate recordings or a campaign: hysteresis, error, noise, lateness."""
+    finish_dead_runs()
+    if recordings_by_axis(runs):
+        if before is not None or model is not None:
+            raise InputError("--before and --model do not apply to a run of several axes")
+        found = api.contour(runs, html, from_s=from_s, to_s=to_s, overwrite=overwrite)
+        print_result(found.to_mapping(), lambda: print_rich(render_contour(found)), as_json=as_json)
+        return
     if len(runs) > 1 or is_folder(runs[0]):
         if from_s is not None or to_s is not None or before is not None:
             raise InputError("--from, --to and --before apply to the report of one recording only")
@@ -141,10 +154,19 @@ def figures(
     print_result({"figures": captions}, lambda: print(lines), as_json=as_json)
 
 
-def render_report(report: RunReport) -> Group:
+def render_contour(report: ContourReport) -> Group:
+    """Return the tables of a run of several axes: contour error, segments, and each axis."""
+    parts = [_two_columns("contour", contour_rows(report))]
+    if len(report.segments) > 1:
+        parts.append(table("segments", *contour_table(report)))
+    axes = (render_report(each, f"axis {name}") for name, each in report.axes.items())
+    return Group(*parts, *axes)
+
+
+def render_report(report: RunReport, title: str = "") -> Group:
     """Return the tables of a report; the segments have their own if there are several."""
     rows, (headings, cells) = run_rows(report), segment_table(report)
-    title = printable(report.name) or "run"
+    title = title or printable(report.name) or "run"
     parts = [_two_columns(title, rows)]
     if quality := quality_rows(report):
         parts = [_two_columns(title, quality), _two_columns("", rows)]

@@ -30,9 +30,14 @@ _NOT_SHOWN = {"waveform.kind", "waveform.unit"}
 _USUAL = {"0.0", "None", ""}
 
 
-@np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
 def page(recording: Recording, report: RunReport, before: Recording | None = None) -> str:
     """Return the page of a run as HTML; ``before`` is the same motion without a compensator."""
+    return html.document(report.name or "run", run_body(recording, report, before))
+
+
+@np.errstate(over="ignore", invalid="ignore")  # of readings near the largest number
+def run_body(recording: Recording, report: RunReport, before: Recording | None = None) -> list[str]:
+    """Return the body of the page of a run, in HTML."""
     terms = ["average cycle"] if report.steady_cycles else []
     if report.peak_hysteresis_percent is not None:
         terms += ["peak hysteresis", "noise floor", "loop area"]
@@ -47,7 +52,7 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
         and (report.complete or name != "ended")
     ]
     terms += [name for name, _ in samples if name == "lateness"]
-    body = [
+    return [
         html.paragraph(report.path, "file"),
         *_end(recording, report),
         html.paragraph(headline(report), "headline"),
@@ -67,7 +72,6 @@ def page(recording: Recording, report: RunReport, before: Recording | None = Non
         html.details("Model", recording.model_yaml) if recording.model_yaml else "",
         *(html.details(name, text) for name, text in sorted(recording.device_files.items())),
     ]
-    return html.document(report.name or "run", body)
 
 
 def headline(report: RunReport) -> str:

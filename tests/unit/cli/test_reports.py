@@ -6,14 +6,18 @@ from pathlib import Path
 
 import pytest
 
+from hilctl import api
 from hilctl.analysis.replay import ReplayResult
 from hilctl.analysis.replay import replay as recompute
+from hilctl.base.errors import InputError
 from hilctl.cli.console import print_rich
 from hilctl.cli.reports import print_replay, render_series
 from hilctl.lab.pages import html
 from hilctl.lab.studies.multi_run.collect import RunSeries
+from tests.axes import run_of_axes
 from tests.unit.lab.studies.multi_run.conftest import grown
 
+CONFIGS = Path(__file__).parents[3] / "configs"
 GOLDEN = Path(__file__).parents[3] / "recordings" / "golden"
 RUN = GOLDEN / "terfenol_uncompensated.mcap"
 
@@ -82,6 +86,47 @@ def test_several_runs_are_one_object_or_a_table(hilctl, json_of):
     _, shown, _ = hilctl("report", RUN, RUN)
     assert shown.startswith("2 of 2 runs")
     assert "2: terfenol_uncompensated.mcap" in shown
+
+
+@pytest.fixture(scope="module")
+def axes(tmp_path_factory):
+    """Two axes of a run on a circle, and a run of another, in one folder."""
+    folder = tmp_path_factory.mktemp("axes")
+    sine = {"kind": "sine", "unit": "um", "amplitude": 20.0, "frequency_hz": 50.0}
+    sine |= {"offset": -6.9, "duration_s": 0.26, "soft_start_s": 0.2}
+    phases = {"x": 90.0, "y": 0.0}
+    settings = {name: {"waveform": sine | {"phase_deg": each}} for name, each in phases.items()}
+    run_of_axes(CONFIGS / "demo.yaml", folder, {"x": settings["x"], "z": settings["y"]}, "other")
+    (folder / "no.mcap").write_text("hello")
+    return run_of_axes(CONFIGS / "demo.yaml", folder, settings)
+
+
+def test_axes_of_a_run_have_one_report(axes, tmp_path, hilctl, json_of):
+    """From any recording of the run, or from all of them in any order."""
+    page = tmp_path / "page.html"
+    code, found = json_of("report", axes["y"], "--html", page)
+    assert (code, list(found["axes"])) == (0, ["x", "y"])
+    assert 0.05 < found["peak_um"] < 1.0
+    assert found["samples"] == found["segments"][0]["samples"] == 2000
+    assert json_of("report", axes["y"], axes["x"])[1] == found
+    assert "contour error" in page.read_text(encoding="utf-8")
+    assert api.contour(axes["x"]).to_mapping() == found
+    shown = hilctl("report", axes["x"], "--from", "0.22", "--to", "0.25")[1]
+    assert "contour error" in shown
+    assert "axis y" in shown
+    assert hilctl("report", axes["x"], "--html", page)[0] == 2
+
+
+def test_recordings_that_are_no_axes_of_one_run(axes, tmp_path, hilctl, json_of, caplog):
+    other = axes["x"].with_name("other.z.mcap")
+    assert "runs" in json_of("report", axes["x"], other)[1]
+    alone = shutil.copy(axes["x"], tmp_path)
+    assert "peak_error_percent" in json_of("report", alone)[1]
+    assert "y" in caplog.records[-1].getMessage()
+    with pytest.raises(InputError):
+        api.contour(alone)
+    assert hilctl("report", axes["x"], "--html", tmp_path / "p.html", "--before", other)[0] == 2
+    assert not (tmp_path / "p.html").exists()
 
 
 def test_folder_is_one_page(tmp_path, monkeypatch, hilctl):
