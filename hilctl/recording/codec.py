@@ -1,6 +1,6 @@
 """Conversion of samples and ticks between protobuf bytes and arrays.
 
-Blocks of samples use the twin of their message, in which packed lists are declared ``bytes``
+Blocks of samples use the twin of their message, which declares packed lists as ``bytes``
 (:func:`hilctl.recording.schema.message_class`), so that no sample becomes a Python number.
 """
 
@@ -30,12 +30,13 @@ class BlockArrays:
     """Content of a ``SampleBlock``; the lengths of its arrays are not checked.
 
     Attributes:
-        dropped: Samples missing before it.
+        dropped: Samples missing before the block.
         flags: uint32[n].
         columns: float64[n] by name of their field; empty ones are omitted.
-        state: float64[s], the compensator's memory before it; mostly empty.
-        previous_command: float64[1] or empty: the command before it.
-        aux: float64[exchanges * channels], the auxiliary channels of each exchange; empty without.
+        state: float64[s], the compensator's memory before the block; usually empty.
+        previous_command: float64[1] or empty: the command before the block.
+        aux: float64[exchanges * channels], the auxiliary channels of each exchange; empty without
+            channels.
     """
 
     tick0: int
@@ -49,7 +50,7 @@ class BlockArrays:
 
 
 def encode_block(block: BlockArrays, t_rel: F64) -> bytes:
-    """Return a ``SampleBlock``; ``t_rel``, float64[n], is the time of its samples in s."""
+    """Return a ``SampleBlock``; ``t_rel``, float64[n], is the time of each sample in s."""
     lists = {
         "t_rel": t_rel,
         "state": block.state,
@@ -113,7 +114,7 @@ def encode_ticks(columns: Mapping[str, I64]) -> bytes:
 
 
 def decode_ticks(data: bytes) -> Ticks:
-    """Return a ``TickBlock``, with columns of any lengths; raise DecodeError if it is none."""
+    """Return the columns of a ``TickBlock``, of any lengths; raise DecodeError if it is invalid."""
     message: Any = _TICKS.FromString(data)
     first, *others = (getattr(message, name) for name in TICK_COLUMNS)
     # An index beyond int64 stays too large for any run.

@@ -33,7 +33,7 @@ _YEAR_NS = 366 * 86_400 * 10**9
 
 
 class Encoded(NamedTuple):
-    """One message: its topic, its Unix time in ns, its bytes."""
+    """One message: topic, Unix time in ns, bytes."""
 
     topic: str
     time_ns: int
@@ -42,13 +42,13 @@ class Encoded(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class RecordingLayout:
-    """Parameters of the messages; stored among a recording's facts, so that messages can be added.
+    """Parameters of the messages, stored in a recording's facts so that recovery can add messages.
 
     Attributes:
         scope_rate_hz: Highest rate of ``/scope``.
         start_unix_ns: Unix time of sample 0 in ns.
         records_input: Whether the compensator's input differs from the reference.
-        ages_readings: Whether the sensor sends unasked, so that its readings have an age.
+        ages_readings: Whether the sensor sends without a request, so that its readings have an age.
         waveform_unit: ``um``, or the command unit without a compensator.
         corrects_readings: Whether displacements are corrected by a calibration.
     """
@@ -71,8 +71,8 @@ class RecordingLayout:
         if not 0 <= self.start_unix_ns <= MAX_UNIX_NS - _YEAR_NS:
             seconds = f"{self.start_unix_ns * 1e-9:.0f} s from 1970 on"
             raise InputError(
-                f"the clock must stand between 1970 and 2261 for a recording, it is at {seconds}: "
-                "set this computer's clock"
+                f"the clock must be between 1970 and 2261 for a recording (got {seconds}): "
+                "set the computer's clock"
             )
 
     def records(self, column: SampleColumn) -> bool:
@@ -123,7 +123,7 @@ class RecordingLayout:
 
 
 def event_message(event: Event, before: Iterable[tuple[RecordedField, F64]] = ()) -> Encoded:
-    """Return the message of an event with its time, and of the samples before it by field."""
+    """Return the message of an event with its time and the preceding samples by field."""
     out = schema.message_class("Event")()
     for name in ("sample", "level", "code", "text"):
         setattr(out, name, getattr(event, name))
@@ -138,7 +138,7 @@ def event_message(event: Event, before: Iterable[tuple[RecordedField, F64]] = ()
 
 
 class MessageMaker:
-    """Encoder of one run; counts samples and those missing between them."""
+    """Encoder of one run; counts samples and missing samples."""
 
     def __init__(self, layout: RecordingLayout) -> None:
         self._layout = layout
@@ -217,11 +217,11 @@ class Topics:
         self._sequence: dict[str, int] = {}
 
     def know(self, topic: str, channel: int, sequence: int) -> None:
-        """Continue a channel of the file, whose next message has the number ``sequence``."""
+        """Continue a channel of the file; its next message gets the number ``sequence``."""
         self._channels[topic], self._sequence[topic] = channel, sequence
 
     def register(self) -> None:
-        """Register hilctl's topics that are not in the file yet."""
+        """Register the topics of hilctl that are not in the file yet."""
         descriptors = schema.descriptor_set()
         for topic, name in schema.TOPICS.items():
             if topic not in self._channels:

@@ -1,7 +1,7 @@
 """MCAP records and chunks from bytes that may be damaged, within a budget of work and memory.
 
-A record is valid if writing it again gives the same bytes: then all lengths in it are right, and so
-is the checksum of an attachment. A chunk is valid if its checksum is right.
+A record is valid if writing it again gives the same bytes, which verifies all its lengths and the
+checksum of an attachment. A chunk is valid if its checksum is correct.
 """
 
 import os
@@ -48,10 +48,10 @@ FRAME = struct.Struct("<BQ")
 LARGEST_BYTES = 2 * LARGEST_CHUNK_BYTES
 """Largest record; a larger length is damaged."""
 FOOTER_BYTES = FRAME.size + 20
-"""Size of the footer, which the closing magic follows."""
+"""Size of the footer, which precedes the closing magic."""
 CHUNK_HEAD = struct.Struct("<QQQII")
 """First and last time of a chunk, uncompressed size, checksum, and length of the compression's
-name; after it come the name, the length of the data, and the data."""
+name; then follow the name, the length of the data, and the data."""
 LENGTH = struct.Struct("<Q")
 
 _FLOOR_BYTES = 64 * 2**20
@@ -83,13 +83,13 @@ class ReadBudget:
     """Limit of the work and memory spent on one file, in proportion to its size.
 
     A file of a few kilobytes can ask for gigabytes: highly compressible streams, overlapping
-    records, empty messages. What hilctl writes stays far below these limits.
+    records, empty messages. Recordings of hilctl stay far below these limits.
     """
 
     def __init__(self, size: int) -> None:
         expanded = _FLOOR_BYTES + _EXPANSION * size
         self._left = {
-            "bytes to read again and again": _FLOOR_BYTES + _READ_TIMES * size,
+            "bytes of overlapping records": _FLOOR_BYTES + _READ_TIMES * size,
             "bytes uncompressed": expanded,
             "bytes of samples, ticks and events": expanded,
             "messages": _MESSAGES + size // _BYTES_PER_MESSAGE,
@@ -97,7 +97,7 @@ class ReadBudget:
 
     def read(self, size: int) -> None:
         """Count bytes read; overlapping records are read more than once."""
-        self._take("bytes to read again and again", size)
+        self._take("bytes of overlapping records", size)
 
     def expand(self, size: int) -> None:
         """Count decompressed bytes."""
@@ -114,7 +114,7 @@ class ReadBudget:
     def _take(self, what: str, amount: int) -> None:
         self._left[what] -= amount
         if self._left[what] < 0:
-            raise DataError(f"holds more {what} than a recording of its size can")
+            raise DataError(f"contains more {what} than a recording of its size can")
 
 
 def parse(opcode: int, body: bytes) -> McapRecord | None:
@@ -184,7 +184,7 @@ def split(data: bytes) -> Iterator[tuple[int, int, McapRecord]]:
 
 
 def inflate(compression: str, data: bytes, size: int, budget: ReadBudget) -> bytes:
-    """Decompress as far as the bytes go, and at most one byte more than ``size``.
+    """Decompress all available bytes, to at most one byte more than ``size``.
 
     A decompressor returns whole blocks (zstd: up to 128 KiB), so the last block of a truncated
     stream is lost.
@@ -210,7 +210,7 @@ def inflate(compression: str, data: bytes, size: int, budget: ReadBudget) -> byt
     while left > 0:
         try:
             piece = stream.read(min(_PIECE_BYTES, left))
-        except (zstandard.ZstdError, RuntimeError, EOFError):  # damaged from here on
+        except (zstandard.ZstdError, RuntimeError, EOFError):  # the rest is damaged
             break
         if not piece:
             break
@@ -235,7 +235,7 @@ class Contents:
 
 
 def contents(chunk: Chunk, budget: ReadBudget, unread: Collection[int] = ()) -> Contents | None:
-    """Return the content of a chunk whose lengths are right, or None if it is damaged."""
+    """Return the content of a chunk with valid lengths, or None if it is damaged."""
     if chunk.uncompressed_size > LARGEST_CHUNK_BYTES:
         return None
     data = inflate(chunk.compression, chunk.data, chunk.uncompressed_size, budget)
@@ -263,5 +263,5 @@ def contents(chunk: Chunk, budget: ReadBudget, unread: Collection[int] = ()) -> 
 
 
 def _index(channel_id: int, entries: list[int]) -> bytes:
-    """Return the message index of a channel: time and place of each message."""
+    """Return the message index of a channel: time and offset of each message."""
     return struct.pack(f"<HI{len(entries)}Q", channel_id, 8 * len(entries), *entries)

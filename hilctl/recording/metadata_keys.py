@@ -20,10 +20,10 @@ END_FIGURES = (
     "peak_error_percent",
     "rms_error_percent",
 )
-"""Facts of the end of a run: the worst value of its segments, as in a report."""
+"""Facts of the end of a run: the worst value of all segments, as in a report."""
 AUX_FACT = "aux"
-"""Fact of a run: its auxiliary channels, a JSON list of objects with name, unit and meaning. Facts
-of its end begin with it: ``aux.NAME.min`` and ``aux.NAME.max``, the range of each channel."""
+"""Fact of a run: its auxiliary channels, a JSON list of objects with name, unit and meaning. Prefix
+of facts of its end: ``aux.NAME.min`` and ``aux.NAME.max``, the range of each channel."""
 AXIS_FACT = "axis"
 """Fact of a run of several axes: name of the recorded axis."""
 AXES_FACT = "axes"
@@ -37,7 +37,7 @@ RECORDINGS = "recordings"
 """Default folder of recordings, relative to the working directory."""
 
 DEVICE_FILES = "device/"
-"""Start of the names of attachments with files of the device, such as its profile."""
+"""Prefix of the names of attachments with files of the device, such as its profile."""
 
 CHECKSUM_FACT = "crc32"
 """Fact of every metadata record: CRC-32 of its name and other facts, in hexadecimal digits."""
@@ -47,13 +47,13 @@ LabelValue: TypeAlias = str | int | float
 
 
 def sealed(name: str, facts: Mapping[str, str]) -> dict[str, str]:
-    """Return the facts of a metadata record as UTF-8 has them, with their checksum."""
+    """Return the facts of a metadata record as UTF-8 can encode them, with their checksum."""
     facts = {key: encodable(value) for key, value in facts.items()}
     return {**facts, CHECKSUM_FACT: _checksum(name, facts)}
 
 
 def unsealed(name: str, metadata: Mapping[str, str]) -> tuple[dict[str, str], bool]:
-    """Return the facts of a metadata record, and whether their checksum is right.
+    """Return the facts of a metadata record, and whether their checksum is correct.
 
     Records of older versions have no checksum and pass.
     """

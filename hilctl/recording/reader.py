@@ -1,4 +1,4 @@
-"""Reading of MCAP files, whole or in pieces."""
+"""Reader of MCAP files, complete or in pieces."""
 
 import logging
 from collections import defaultdict
@@ -88,7 +88,7 @@ class RecordingBuilder:
 
     def _refuse_late(self, what: str) -> None:
         if self._facts:
-            raise DataError(f"{what} stands behind the first samples")
+            raise DataError(f"{what} follows the first samples")
 
     def _read_or_not(self, channel: int) -> None:
         # /scope is a copy of /samples and has 90 % of the messages at 50 kHz in blocks.
@@ -100,7 +100,7 @@ class RecordingBuilder:
     def _message(self, record: Message) -> None:
         decoded, problem = self._sound.decoded(record)
         if problem:
-            raise DataError(f"{problem} ('hilctl recover' leaves such messages out)")
+            raise DataError(f"{problem} ('hilctl recover' omits such messages)")
         topic = self._sound.topic(record.channel_id)
         if topic == "/samples" and self._within(decoded.tick0, decoded.tick0 + decoded.n):
             self._block(decoded)
@@ -152,7 +152,7 @@ class RecordingBuilder:
         return aux_channels_of(self._run)
 
     def _aux_of(self, block: BlockArrays) -> F64:
-        """Return float64[n, a], the value of its exchange for each sample; NaN if damaged."""
+        """Return float64[n, a], for each sample the value of its exchange; NaN if damaged."""
         width = len(self._channels)
         exchanges = block.aux.size // width if width else 0
         if not exchanges or exchanges * width != block.aux.size or block.n % exchanges:
@@ -161,9 +161,9 @@ class RecordingBuilder:
         return values.repeat(block.n // exchanges, axis=0)
 
     def piece(self, path: Path, *, last: bool = False) -> Recording:
-        """Return everything taken since the last piece; the last one has the end of the run."""
+        """Return the records taken since the last piece; the last piece has the end of the run."""
         if not self._run:
-            lost = "" if self._scan.is_mcap else "is not an MCAP file, or its start is lost: "
+            lost = "" if self._scan.is_mcap else "is not an MCAP file, or its start is missing: "
             text = f"{path}: {lost}holds no run of hilctl (metadata hilctl.run is missing)"
             raise DataError(text)
         try:
@@ -225,7 +225,7 @@ class RecordingBuilder:
 
 
 def _samples(index: I64, flags: U32, unit: CommandUnit, values_of: Callable[[str], F64]) -> Samples:
-    """Return samples from the values of their fields; an omitted column equals another one."""
+    """Return samples from the values of their fields; an omitted column equals another column."""
     columns: dict[str, F64] = {}
     for name, column in COLUMNS.items():
         field = column.field(unit).name
@@ -299,9 +299,9 @@ class RecordingStream:
     """A recording of any length, in pieces; each iteration reads the file again.
 
     Every piece is a :class:`~hilctl.recording.recording.Recording` of the next samples, ticks,
-    events and replay starts. The last one, which may have no samples, also has the end, the number
-    of missing samples and the segments cut to the time range. Joined, the pieces are the result of
-    :func:`read`.
+    events and replay starts. The last piece, which may have no samples, also has the end, the
+    number of missing samples and the segments, cut to the time range. Joined, the pieces are the
+    result of :func:`read`.
     """
 
     def __init__(self, path: Path, stretch: TimeRange | None = None) -> None:
@@ -310,7 +310,7 @@ class RecordingStream:
         self._warned: set[str] = set()
 
     def __iter__(self) -> Iterator[Recording]:
-        """Yield the pieces; raise DataError as :func:`read`, or if facts follow samples."""
+        """Yield the pieces; raise DataError as :func:`read` does, or if facts follow samples."""
         pieces = _prefetched(_read(self.path, self.stretch, PIECE_SAMPLES, self._warned))
         return self.stretch.cut_pieces(pieces) if self.stretch else pieces
 
@@ -332,7 +332,7 @@ def _read(
 ) -> Generator[Recording, None, None]:
     """Yield pieces of at least that many samples, uncut; one piece if None.
 
-    A warning is added to ``warned``, and is not repeated.
+    Each warning is added to ``warned`` and logged once.
     """
     try:
         with open_binary(path) as stream:
@@ -347,17 +347,17 @@ def _read(
     except FileNotFoundError:
         raise DataError(no_such_file(path)) from None
     except OSError as error:
-        raise DataError(f"{path}: can't be read: {reason(error)}") from None
+        raise DataError(f"{path}: cannot be read: {reason(error)}") from None
     except DataError as error:
-        text = str(error).removeprefix(f"{path}: ")  # that of a piece has it already
+        text = str(error).removeprefix(f"{path}: ")  # an error of a piece has the path already
         raise DataError(f"{path}: {text}") from None
     last = builder.piece(path, last=True)
     if not scan.sound:
         problem, advice = "is still being recorded", ""
         if not live:
             problem = scan.describe()
-            advice = " ('hilctl recover' makes it a whole file again, and keeps this one)"
-        text = f"{path}: {problem}; {builder.samples} samples are read{advice}"
+            advice = " ('hilctl recover' repairs it and keeps the original)"
+        text = f"{path}: {problem}; {builder.samples} samples read{advice}"
         if text not in warned:
             warned.add(text)
             _log.warning("%s", text)

@@ -20,8 +20,8 @@ class Ticks:
     """Timing of every tick.
 
     Attributes:
-        first_sample: int64[m], index of the tick's first sample.
-        deadline_ns: int64[m], when the tick was due, since the start of the run.
+        first_sample: int64[m], index of the first sample of the tick.
+        deadline_ns: int64[m], when the tick was due, relative to the start of the run.
         late_ns: int64[m], lateness of the exchange (of the wake-up in older recordings); after a
             skip, from the first missed tick.
         exchange_ns: int64[m], duration of the exchange with the device.
@@ -33,12 +33,12 @@ class Ticks:
     exchange_ns: I64
 
     def rows(self, chosen: I64 | npt.NDArray[np.bool_]) -> "Ticks":
-        """Return the ticks at indices, or those that a mask selects."""
+        """Return the ticks selected by indices or a mask."""
         return Ticks(*(getattr(self, name)[chosen] for name in TICK_COLUMNS))
 
 
 TICK_COLUMNS = tuple(each.name for each in fields(Ticks))
-"""Names of the columns of ticks, also those of a block's header."""
+"""Names of the columns of ticks, also in a block's header."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -47,8 +47,8 @@ class ReplayStart:
 
     Attributes:
         sample: Index of the block's first sample.
-        state: float64[s], the compensator's memory before it.
-        previous_command: Command before it, in the command unit.
+        state: float64[s], the compensator's memory before the block.
+        previous_command: Command before the block, in the command unit.
     """
 
     sample: int
@@ -93,5 +93,5 @@ class Recording:
 
     @property
     def aux(self) -> Mapping[str, F64]:
-        """Auxiliary channels by name, float64[n]; the samples of a block have one value."""
+        """Auxiliary channels by name, float64[n]; all samples of a block have the same value."""
         return {each.name: self.samples.aux[:, k] for k, each in enumerate(self.aux_channels)}

@@ -1,4 +1,4 @@
-"""Locks of recording files, and the safe replacement of one."""
+"""Locks on recording files, and safe replacement of a file."""
 
 import errno
 import os
@@ -11,7 +11,7 @@ from hilctl.base.private_dirs import is_locked, take_lock
 
 
 def lock(stream: BinaryIO, *, shared: bool = False) -> None:
-    """Mark a recording as being written, or as being recovered (shared), until it is closed.
+    """Mark a recording as being written, or as being recovered (shared), until the file is closed.
 
     Raise BlockingIOError if another process is writing it.
     """
@@ -26,12 +26,12 @@ def lock(stream: BinaryIO, *, shared: bool = False) -> None:
 
 
 def is_being_recorded(stream: BinaryIO | FileIO) -> bool:
-    """Return whether a run is recording to an open file; False if there are no locks."""
+    """Return whether a run is recording to an open file; False on a file system without locks."""
     return is_locked(stream)
 
 
 class Replacement:
-    """A new file for the place of an old one; :meth:`close` without :meth:`put` removes it.
+    """A new file that replaces an old one; :meth:`close` without :meth:`put` removes it.
 
     Raise FileExistsError if ``output`` exists, OSError if the folder cannot be written.
     """
@@ -45,9 +45,9 @@ class Replacement:
         Path(self.stream.name).chmod(self._old.stat().st_mode)
 
     def put(self) -> Path:
-        """Sync the new file, move it to its destination, and return the place of the old one.
+        """Sync the new file, move it to its destination, and return the path of the old one.
 
-        A complete file has the old name at every moment, except during one renaming on file systems
+        The old name always refers to a complete file, except during one renaming on file systems
         without hard links.
         """
         self._file.secure()  # before the old file is touched: a full disk must change nothing
@@ -56,7 +56,7 @@ class Replacement:
         return kept
 
     def close(self) -> None:
-        """Close the new file; remove it unless it was put."""
+        """Close the new file; remove it unless :meth:`put` has moved it."""
         self._file.close()
 
     def _keep(self) -> Path:

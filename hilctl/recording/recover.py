@@ -27,8 +27,8 @@ from hilctl.recording.validation import MAX_UNIX_NS, MessageValidator, count_of,
 from hilctl.recording.writer import mcap_writer
 
 _UNKNOWN_END = (
-    "what was exchanged after it is unknown: at most the last unflushed interval where hilctl was "
-    "killed, perhaps more where the power failed"
+    "later samples are unknown: at most the last unflushed interval if hilctl was killed, possibly "
+    "more after a power failure"
 )
 
 
@@ -40,7 +40,7 @@ class Recovered:
         original: Where the original bytes are kept; None if nothing was written because nothing
             could be repaired.
         reason: Damage and losses, in one line.
-        added_samples: Those of them that were not in the original.
+        added_samples: Samples that were not in the original.
     """
 
     path: Path
@@ -98,12 +98,12 @@ class Survey:
 
     @property
     def samples(self) -> int:
-        """Samples in it."""
+        """Samples in the file."""
         return self._sound.samples
 
     @property
     def next_sample(self) -> int:
-        """Index after the last sample in it."""
+        """Index after the last sample in the file."""
         return self._sound.next_sample
 
 
@@ -202,7 +202,7 @@ class Rewritten:
             "recovered": reason,
         }
         metadata = sealed("hilctl.end", {**facts, **counted})
-        if not self._survey.end_is_right:  # a right checksum would hide the damage
+        if not self._survey.end_is_right:  # a correct checksum would hide the damage
             metadata[CHECKSUM_FACT] = "wrong before recovery"
         self._writer.add_metadata("hilctl.end", metadata)
         self._writer.finish()
@@ -215,7 +215,7 @@ class Rewritten:
         if self.missing:
             parts.append(f"{self.missing} samples known to be missing")
         if not known:
-            parts.append(f"the last sample is {last}" if self.samples else "no sample is left")
+            parts.append(f"the last sample is {last}" if self.samples else "no sample remains")
             parts.append(_UNKNOWN_END)
         elif not self.missing:
             parts.append("no sample is lost")
@@ -246,7 +246,7 @@ def _named_errors(path: Path, output: Path | None) -> Iterator[None]:
 
 
 def _plausible(event: Event) -> bool:
-    """Return whether an event from memory has a possible place and time."""
+    """Return whether an event from memory has a possible sample and time."""
     return 0 <= event.sample < LAST_SAMPLE and 0 <= event.time_ns <= MAX_UNIX_NS
 
 
@@ -308,28 +308,28 @@ def recover_recording(
 
 def _left_alone(path: Path, survey: Survey) -> Recovered:
     missing, damages = survey.next_sample - survey.samples, tuple(survey.scan.damages)
-    text = "sound: nothing to recover"
+    text = "intact, nothing to repair"
     if damages:
-        text = f"{survey.scan.describe()}; this cannot be repaired, all else is sound"
+        text = f"{survey.scan.describe()}; this damage cannot be repaired, the rest is intact"
     return Recovered(path, None, text, survey.samples, 0, missing, damages)
 
 
 def _check(survey: Survey, more: list[BlockBatch]) -> RecordingLayout | None:
     """Reject a file with nothing to recover; return the layout of the samples to add, if any."""
     if not survey.records:
-        raise DataError("holds no whole record: there is nothing to recover")
+        raise DataError("contains no complete record: nothing to recover")
     if not more:
         return None
     try:
         return RecordingLayout.from_facts(survey.run)
     except DataError as error:
-        raise DataError(f"samples can't be added: {error}") from None
+        raise DataError(f"samples cannot be added: {error}") from None
 
 
 def _not_in_file(extra: Iterable[BlockBatch], next_sample: int) -> Iterator[BlockBatch]:
     """Yield the blocks from ``next_sample`` on, with new counts of the gaps before them.
 
-    They come from the memory of a process that died: implausible blocks are omitted.
+    They come from the memory of a crashed process, so implausible blocks are omitted.
     """
     for batch in extra:
         firsts = batch.heads[:, BlockHeader.FIRST_SAMPLE].tolist()

@@ -1,9 +1,9 @@
-"""Scan of an MCAP file, intact or not, for all valid records and what remains of damaged chunks.
+"""Scan of an MCAP file, intact or not, for all valid records and the rest of damaged chunks.
 
 A chunk is valid by its checksum, any other record by its lengths. After damage the scan continues
-at the next probable chunk, metadata, attachment or end of data. Of a chunk at the truncated end of
-a file, messages are read as far as possible; without a checksum, each must decode. A damaged chunk
-elsewhere is omitted, because any number in it may be wrong.
+at the next probable chunk, metadata, attachment or end of data. From a chunk at the truncated end
+of a file, as many messages as possible are read; without a checksum, each must decode. A damaged
+chunk elsewhere is omitted, because any number in it may be wrong.
 """
 
 import re
@@ -74,7 +74,7 @@ def next_likely(stream: BinaryIO, at: int, size: int) -> int:
 
 
 def tail_kind(stream: BinaryIO, at: int, size: int) -> str:
-    """Return the kind of a tail without records: ``zeros`` or ``unreadable bytes``."""
+    """Return the kind of trailing bytes without records: ``zeros`` or ``unreadable bytes``."""
     for start in range(at, size, _WINDOW_BYTES):
         stream.seek(start)
         if stream.read(_WINDOW_BYTES).strip(b"\0"):
@@ -106,7 +106,7 @@ def _before_zeros(chunk: Chunk) -> bytes:
 
 
 def _as_far_as_it_goes(raw: bytes) -> Chunk | None:
-    """Return a chunk by the length of its data instead of its record, cut at the end of ``raw``."""
+    """Return a chunk from the length of its data, not of its record, cut at the end of ``raw``."""
     start = FRAME.size + CHUNK_HEAD.size
     if len(raw) < start:
         return None
@@ -127,13 +127,13 @@ def _as_far_as_it_goes(raw: bytes) -> Chunk | None:
 
 
 def _is_cut(chunk: Chunk, raw: bytes) -> bool:
-    """Return whether a chunk is truncated, by the end of the file or zeros, not damaged."""
+    """Return whether a chunk is truncated by the end of the file or zeros, but not damaged."""
     length = FRAME.unpack_from(raw)[1]
     return len(raw) < FRAME.size + length or chunk.data.endswith(b"\0")
 
 
 def _believable(data: bytes) -> list[McapRecord]:
-    """Return records without a valid checksum, up to the first that is not hilctl's.
+    """Return records without a valid checksum, up to the first one that hilctl cannot have written.
 
     If invalid bytes follow instead of the start of another record, the last record may end with
     some of them and is omitted.
@@ -165,7 +165,7 @@ def _decodes(message: Message) -> bool:
 
 @cache
 def own_channels() -> dict[int, tuple[Schema, Channel]]:
-    """Return schema and channel of each of hilctl's channel ids, in order."""
+    """Return schema and channel of each channel id of hilctl, in order."""
     descriptors = schema.descriptor_set()
     return {
         number: (
@@ -182,7 +182,7 @@ _KNOWN = {opcode.value for opcode in Opcode}
 
 @dataclass(frozen=True, slots=True)
 class Damage:
-    """A damaged part of a file.
+    """A damaged range of a file.
 
     Attributes:
         start: Offset of its first byte.
@@ -213,15 +213,15 @@ class _Found(NamedTuple):
 
 
 class RecoveryScan:
-    """Scan of a file; its attributes are final when :meth:`records` is exhausted.
+    """Scan of a file; its attributes are final after :meth:`records` is exhausted.
 
     Args:
         sound: Validator whose invalid messages are omitted and noted as damage; None yields all.
 
     Attributes:
         finished: Whether footer and closing magic exist and the index matches the data.
-        unread: Ids of channels whose messages are omitted from now on; the channels must have been
-            yielded.
+        unread: Ids of channels whose messages are omitted from now on; these channels must have
+            been yielded before.
     """
 
     def __init__(self, stream: BinaryIO, sound: MessageValidator | None = None) -> None:
@@ -330,7 +330,7 @@ class RecoveryScan:
         record = found.record
         if record is None:
             return []
-        if self._indexes:  # some of those of the previous chunk are missing
+        if self._indexes:  # some indexes of the previous chunk are missing
             self._note(at, at, "index")
             self._indexes = {}
         if found.inside is not None:
@@ -376,7 +376,7 @@ class RecoveryScan:
             self._note(end, self.size, tail_kind(self._stream, end, self.size))
 
     def _with_channels(self, records: list[McapRecord], at: int) -> Iterator[McapRecord]:
-        """Yield records, and hilctl's own channels before a message whose channel is lost."""
+        """Yield records, with a channel of hilctl before a message whose channel is lost."""
         for record in records:
             if isinstance(record, Channel):
                 self._channels.add(record.id)

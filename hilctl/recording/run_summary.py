@@ -1,4 +1,4 @@
-"""Facts of a run from both ends of its file, without reading samples."""
+"""Facts of a run from the start and the end of its file, without reading samples."""
 
 import os
 from collections.abc import Mapping
@@ -26,7 +26,7 @@ class RunSummary:
     """Facts of a run from both ends of its file.
 
     Attributes:
-        end: Facts of its end; empty if the file is not finished.
+        end: Facts of the run's end; empty if the file is not finished.
         state: ``finished``, ``recording`` (a run is writing to it), ``unfinished`` (truncated) or
             ``damaged`` (a checksum of the facts or the index is wrong; unverified facts are
             omitted). Damage between the ends is not detected.
@@ -50,7 +50,7 @@ def read_ends(path: Path) -> RunSummary:
         with open_binary(path, _BUFFER_BYTES) as stream:
             return _ends(stream)
     except OSError as error:
-        raise DataError(f"{path}: can't be read: {reason(error)}") from None
+        raise DataError(f"{path}: cannot be read: {reason(error)}") from None
     except DataError as error:
         raise DataError(f"{path}: {error}") from None
 
@@ -74,7 +74,7 @@ def _ends(stream: BinaryIO) -> RunSummary:
 def _run_metadata(stream: BinaryIO, size: int) -> Mapping[str, str]:
     stream.seek(0)
     if stream.read(len(MAGIC)) != MAGIC:
-        raise DataError("is not an MCAP file, or its start is lost")
+        raise DataError("is not an MCAP file, or its start is missing")
     for record in islice(records_from(stream, len(MAGIC), size), _MOST_BEFORE):
         if isinstance(record, Metadata) and record.name == "hilctl.run":
             return record.metadata
@@ -82,7 +82,7 @@ def _run_metadata(stream: BinaryIO, size: int) -> Mapping[str, str]:
 
 
 def _end_metadata(stream: BinaryIO) -> Mapping[str, str] | None:
-    """Return the facts of the end by footer and index; None if those are missing."""
+    """Return the facts of the end, located by footer and index; None if these are missing."""
     if (place := footer_of(stream)) is None:
         return None
     footer_at, footer = place

@@ -1,6 +1,6 @@
 """Protobuf schemas of a recording's topics.
 
-A field number is never reused. Those of the columns are in :class:`hilctl.base.samples.Samples`.
+A field number is never reused. :class:`hilctl.base.samples.Samples` has those of the columns.
 """
 
 from functools import cache
@@ -75,7 +75,7 @@ _MESSAGES: dict[str, _Fields] = {
         "before_sample": (5, _UINT64, True),
         "before_flags": (10, _UINT32, True),
         **_columns("before", "before_"),
-        # Its values by name.
+        # Values of the event by name.
         "value_names": (13, _STRING, True),
         "values": (14, _DOUBLE, True),
     },

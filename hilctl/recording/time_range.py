@@ -1,4 +1,4 @@
-"""Time range of a run: cut it out of a recording, and find its records in a finished file."""
+"""Time range of a run: cut a recording to it, and find its records in a finished file."""
 
 import math
 import zlib
@@ -18,7 +18,7 @@ from hilctl.recording.recording import Recording
 from hilctl.recording.validation import RATES_HZ, number_of
 
 _END_OF_ANY_PART = {"code", "reason", "output_safe", "output_state", "ended", "recovered"}
-"""Facts of the end that hold for every part of a run; the others count the whole run."""
+"""Facts of the end that are valid for every part of a run; the others count the whole run."""
 _CRC_BYTES = 4
 _NS = 10**9
 _MAX_DIGITS = 20
@@ -37,7 +37,7 @@ class TimeRange:
     to_s: float | None = None
 
     def samples(self, sample_rate_hz: float) -> tuple[int, int]:
-        """Return the first samples at both times or later; raise DataError if one is not finite."""
+        """Return the first sample at or after each time; raise DataError if one is not finite."""
         start = 0 if self.from_s is None else _first_at_or_after(self.from_s, sample_rate_hz)
         stop = LAST_SAMPLE if self.to_s is None else _first_at_or_after(self.to_s, sample_rate_hz)
         return start, stop
@@ -54,7 +54,7 @@ class TimeRange:
     def cut_pieces(self, pieces: Iterable[Recording]) -> Iterator[Recording]:
         """Cut the pieces of a recording; raise DataError if no piece has a sample in this range.
 
-        The last piece has the counters, and segments that end with its last sample.
+        The last piece has the counters, and its segments end with its last sample.
         """
         held: Recording | None = None
         read = found = first = end = 0
@@ -68,7 +68,7 @@ class TimeRange:
                 first, end = first if found else int(index[0]), int(index[-1]) + 1
                 found += index.size
         if held is None or not found:
-            whole = "its samples are elsewhere" if read else "it has none"
+            whole = "its samples are outside this range" if read else "it has none"
             path = held.path if held else "the recording"
             raise DataError(f"{path}: holds no sample from {self}: {whole}")
         yield replace(
@@ -117,7 +117,8 @@ def _first_at_or_after(t_s: float, rate_hz: float) -> int:
 def places_of(stream: BinaryIO, time_range: TimeRange) -> list[int] | None:
     """Return the sorted offsets of the records of a time range; None without a valid index.
 
-    These are chunks with its samples, ticks or any events, and all metadata and attachments.
+    These are chunks with samples or ticks in the range, chunks with events, and all metadata and
+    attachments.
     """
     summary = _summary(stream)
     chunks = [record for record in summary if isinstance(record, ChunkIndex)]
@@ -164,7 +165,7 @@ def _run_facts(stream: BinaryIO, indexes: list[AttachmentIndex | MetadataIndex])
 
 
 def _summary(stream: BinaryIO) -> list[McapRecord]:
-    """Return the records of the index; none if it is damaged, missing or too large."""
+    """Return the records of the index; empty if it is damaged, missing or too large."""
     if (place := footer_of(stream)) is None:
         return []
     footer_at, footer = place

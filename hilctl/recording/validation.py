@@ -1,7 +1,7 @@
 """Checks of the facts, segments and messages of a recording; compiled kernels rely on them.
 
-A check of a message returns the problem, or an empty text. The reader rejects the file; recovery
-omits the message.
+A check of a message returns the problem, or an empty text. On a problem the reader rejects the file
+and recovery omits the message.
 """
 
 import math
@@ -59,11 +59,11 @@ _DECODERS: dict[str, Callable[[bytes], Any]] = {
 
 
 def decode(topic: str, data: bytes) -> tuple[Any, str]:
-    """Decode a message of one of hilctl's topics; also return the problem, if any."""
+    """Decode a message of a topic of hilctl; also return the problem, if any."""
     try:
         return _DECODERS[topic](data), ""
     except (DecodeError, ValueError) as error:
-        return None, f"can't be decoded: {error}"
+        return None, f"cannot be decoded: {error}"
 
 
 def block_problem(block: BlockArrays, next_sample: int) -> str:
@@ -71,7 +71,7 @@ def block_problem(block: BlockArrays, next_sample: int) -> str:
     if not block.n:
         return "holds no sample"
     if not next_sample <= block.tick0 < LAST_SAMPLE:
-        return f"sample {block.tick0} can't follow sample {next_sample - 1}"
+        return f"sample {block.tick0} cannot follow sample {next_sample - 1}"
     lengths = {name: values.size for name, values in block.columns.items()}
     lengths["flags"] = block.flags.size
     # A million samples are thousands of blocks, all with the same columns.
@@ -86,7 +86,7 @@ def block_problem(block: BlockArrays, next_sample: int) -> str:
 
 @cache
 def has_all(names: tuple[str, ...]) -> bool:
-    """Return whether the fields of complete columns are all the required ones."""
+    """Return whether the fields of the complete columns include all required ones."""
     return not _wrong_lengths(dict.fromkeys(names, 1), "", 1)
 
 
@@ -115,7 +115,7 @@ def ticks_problem(ticks: Ticks) -> str:
         # The lowest integer has no magnitude.
         lowest, highest = int(columns[name].min()), int(columns[name].max())
         if max(-lowest, highest) > LONGEST_NS:
-            return f"{name} of {max(-lowest, highest)} ns is longer than any run"
+            return f"{name} of {max(-lowest, highest)} ns is longer than a run can be"
     return ""
 
 
@@ -145,7 +145,7 @@ def _lengths_before(event: Any) -> dict[str, int]:
 
 
 def _is_fade(event: Any) -> bool:
-    """Return whether its values are those of a crossfade that a replay can repeat."""
+    """Return whether an event describes a crossfade that a replay can repeat."""
     values = dict(zip(event.value_names, event.values, strict=True))
     whole = values.keys() >= {"share", "samples", "slope", "at_zero"}
     return whole and 0.0 <= values["share"] <= 1.0 and values["samples"] >= 1.0
@@ -166,7 +166,7 @@ def _listed(lengths: Mapping[str, int]) -> str:
 
 
 class MessageValidator:
-    """Validator of a file's messages under hilctl's topics, in order."""
+    """Validator of a file's messages in the topics of hilctl, in order."""
 
     def __init__(self) -> None:
         self._schemas: dict[int, str] = {}
@@ -178,11 +178,11 @@ class MessageValidator:
         """Samples in valid messages."""
 
     def topic(self, channel: int) -> str:
-        """Return the topic of a channel if it is one of hilctl's, otherwise an empty text."""
+        """Return the topic of a channel if it is a topic of hilctl, otherwise an empty text."""
         return self._topics.get(channel, "")
 
     def problem(self, record: McapRecord) -> str:
-        """Return why hilctl cannot have written a record under its topics, or an empty text."""
+        """Return why hilctl cannot have written a record, or an empty text."""
         match record:
             case Schema():
                 self._schemas[record.id] = record.name
@@ -209,9 +209,9 @@ class MessageValidator:
             self._refused[channel.id] = text
 
     def decoded(self, record: Message) -> tuple[Any, str]:
-        """Return a decoded message under one of hilctl's topics, and its problem, if any."""
+        """Return a decoded message of a topic of hilctl, and its problem, if any."""
         topic = self._topics[record.channel_id]
-        if topic == "/scope":  # a copy of /samples that nothing here reads
+        if topic == "/scope":  # a copy of /samples, not read here
             return None, ""
         message, problem = decode(topic, record.data)
         if not problem:
@@ -277,7 +277,7 @@ def short(text: str) -> str:
 def segments_of(text: str) -> tuple[Segment, ...]:
     """Return the segments of a run from their JSON text; raise ValueError if they are invalid."""
     if len(text) > _MOST_TEXT:
-        raise ValueError(f"segments: {len(text)} characters are more than any run has")
+        raise ValueError(f"segments: {len(text)} characters are more than a run can have")
     try:
         segments = _SEGMENTS.validate_json(text)
     except ValidationError as error:
@@ -286,9 +286,10 @@ def segments_of(text: str) -> tuple[Segment, ...]:
     for number, each in enumerate(segments):
         places = [end, each.start, each.steady_start, each.steady_stop, each.stop, LAST_SAMPLE - 1]
         if places != sorted(places):
-            rule = "its samples must follow those before it and rise"
+            rule = "sample indices must follow the previous segment and rise"
             raise ValueError(f"segments: {number}: {rule}: {places}")
         if each.period and each.period < SHORTEST_PERIOD:
-            raise ValueError(f"segments: {number}: a period of {each.period!r} samples can't be")
+            rule = f"period must be 0 or >= {SHORTEST_PERIOD:g} samples"
+            raise ValueError(f"segments: {number}: {rule}: {each.period!r}")
         end = each.stop
     return segments

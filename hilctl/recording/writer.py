@@ -1,4 +1,4 @@
-"""Writer of a run's MCAP file, and the file that it writes to.
+"""Writer of a run's MCAP file, and its output file.
 
 Metadata and attachments come first, so that a truncated file can be identified. Chunks are closed
 and written every ``flush_s``, which limits the loss if the recorder is killed.
@@ -88,7 +88,7 @@ class RecordingWriter:
         self._writer.flush()
 
     def finish(self, end: Mapping[str, str], ended_at: int) -> None:
-        """Write facts of the end, index and footer; samples before ``ended_at`` are missing."""
+        """Write facts of the end, index and footer; count unwritten samples before ``ended_at``."""
         self._late_missing = ended_at - self.samples
         counted = {"recorded_samples": str(self.samples), "missing_samples": str(self.missing)}
         self._writer.add_metadata("hilctl.end", sealed("hilctl.end", {**end, **counted}))
@@ -142,8 +142,8 @@ class PendingFile:
 
         Raises:
             OSError: The disk rejects them, or the file was deleted, renamed or truncated (ESTALE);
-                they stay pending. Or the disk has lost earlier bytes, which the kernel reports at
-                the next sync: then every flush fails.
+                they stay pending. Or the disk lost earlier bytes (the kernel reports this at the
+                next sync); then every flush fails.
         """
         if self._lost is not None:
             raise self._lost

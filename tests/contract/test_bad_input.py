@@ -242,14 +242,14 @@ def test_recording_to_read(refused, place, words):
     (place / "folder.mcap").mkdir()
     (place / "text.mcap").write_text("no recording")
     os.mkfifo(place / "pipe.mcap")
-    folder = "can't be read: Is a directory"
+    folder = "cannot be read: Is a directory"
     if words == "report {}":  # a folder stands for all of its recordings
         folder = "contains no recordings"
     for name, message in [
         ("lost.mcap", "lost.mcap: no such file"),
         ("folder.mcap", f"folder.mcap: {folder}"),
         ("text.mcap", "text.mcap: is not an MCAP file"),
-        ("pipe.mcap", "pipe.mcap: can't be read: Not a regular file"),
+        ("pipe.mcap", "pipe.mcap: cannot be read: Not a regular file"),
     ]:
         refused(message, *words.format(name).split())
 
