@@ -1,4 +1,4 @@
-"""The fixed-rate loop: everything that a tick executes; no file, no log, no other thread."""
+"""The fixed-rate loop: all code that a tick executes, without files, logs or other threads."""
 
 PUBLIC = (
     "adaptation", "block", "compensator", "feedback", "interlocks", "lead_in", "limiter", "loop",

@@ -4,13 +4,13 @@ The difference between actuator and model is an operator of few parameters (kern
 Its inverse precedes the model's inverse, for every kind of model. Its output is recorded as the
 compensator's input, so the run replays like any other.
 
-The parameters follow the gradient of the squared tracking error. The regressors belong to the input
-that a displacement shows, delayed by compensator, sensor and device. They are orthogonalised over
-the reference, so that all parameters converge equally fast and none replaces another (B. Widrow and
-S. D. Stearns, "Adaptive Signal Processing", 1985, chapter 8; B. Widrow and E. Walach, "Adaptive
-Inverse Control", 1996). Normalisation, a dead zone, leakage and projection onto the bounds keep the
-parameters bounded for any displacement (P. A. Ioannou and J. Sun, "Robust Adaptive Control", 1996,
-chapter 8). Their rate is limited as well.
+The parameters follow the gradient of the squared tracking error. The regressors are those of the
+input that caused a displacement, delayed by compensator, sensor and device. They are orthogonalised
+over the reference, so that all parameters converge equally fast and none replaces another (B.
+Widrow and S. D. Stearns, "Adaptive Signal Processing", 1985, chapter 8; B. Widrow and E. Walach,
+"Adaptive Inverse Control", 1996). Normalisation, a dead zone, leakage and projection keep the
+parameters within their bounds for any displacement (P. A. Ioannou and J. Sun, "Robust Adaptive
+Control", 1996, chapter 8). Their rate is limited as well.
 """
 
 import math
@@ -72,7 +72,7 @@ class DisplacementOperator:
         self.bounds, self.settings, self.table, self.shape = bounds, settings, table, shape
         self.thresholds = np.array(THRESHOLDS)
         self.constants = settings, table, shape, self.thresholds
-        """What the kernels need of it."""
+        """The operator in the form of the kernels."""
 
     @classmethod
     def over(
@@ -83,7 +83,7 @@ class DisplacementOperator:
         ``told`` selects representative parts of the reference; None for all of it.
 
         Raises:
-            InputError: Within these bounds the operator may have no inverse.
+            InputError: The operator may have no inverse within these bounds.
         """
         spans = [(each.min(), each.max()) for each in chunks(reference_um, told)]
         low, high = float(np.min(spans)), float(np.max(spans))
@@ -121,7 +121,7 @@ class DisplacementOperator:
         kernel.adapted_input(input_um, size, before, after, self.constants, memory)
 
     def form(self, values: F64) -> F64:
-        """Return o, g and w_i (float64[m]) of adapted parameters."""
+        """Convert adapted parameters to o, g and w_i: float64[m]."""
         formed: F64 = self.shape.T @ values
         return formed
 
@@ -166,14 +166,14 @@ class DisplacementOperator:
 
 
 class Adaptation:
-    """Adaptation of one run; called in every tick, it never waits, and its output is finite.
+    """Adaptation of one run; called in every tick; it never blocks, and its output is finite.
 
     Args:
         time_constant_s: Time constant of the parameters, > 0.
-        due_after: Samples from a reference to its displacement.
-        shown_after: Samples from an input to its displacement.
-        noise_um: Standard deviation of the sensor's noise; None: set by :meth:`take_noise`, and
-            nothing is adapted before.
+        due_after: Delay from a reference to its displacement, in samples.
+        shown_after: Delay from an input to its displacement, in samples.
+        noise_um: Standard deviation of the sensor's noise; if None, :meth:`take_noise` sets it and
+            starts the adaptation.
     """
 
     def __init__(
@@ -254,8 +254,8 @@ class Adaptation:
     def take(self, block: Block) -> None:
         """Adapt to an answered block, in any phase of the run.
 
-        Samples with a flag (interlock, limiter, skipped ticks, ramp, conditioning) change nothing,
-        nor do displacements that show the inputs of such samples.
+        Samples with a flag (interlock, limiter, skipped ticks, ramp, conditioning) and
+        displacements caused by their inputs are ignored.
         """
         if block.skipped:
             due, shown, _places = self._lines

@@ -6,7 +6,7 @@ COMMAND = [*COLUMNS].index("command")
 
 
 class Block:
-    """A slot with B samples; a block stays in it until it is recorded.
+    """A slot with B samples, occupied until the block is recorded.
 
     Args:
         head: Fields of :class:`hilctl.base.samples.BlockHeader`, int64 each.
@@ -16,7 +16,7 @@ class Block:
         due: Whether the block is recorded; False while the loop only waits for answers.
         guarded: Whether a tripped interlock ends the run: the block starts in the waveform or the
             conditioning.
-        skipped: Samples skipped before it.
+        skipped: Samples skipped before the block.
         state: The compensator's state before the block, then the command before it: float64[s].
         memory: The compensator's state: float64[s - 1].
         flags: Bits of :class:`hilctl.base.samples.Flag` and the interlocks: uint32[B].

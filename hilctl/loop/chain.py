@@ -1,6 +1,6 @@
-"""One axis of a run: from its reference to its commands, and from its readings to its interlocks.
+"""One axis of a run: from reference to commands, and from readings to interlocks.
 
-A chain has no time: the loop calls it in the phases of the run, block by block.
+A chain has no clock: the loop calls it block by block in each phase of the run.
 """
 
 from collections import deque
@@ -30,23 +30,23 @@ _LOST = (Flag.SENSOR_INVALID | Flag.UNANSWERED).value
 
 
 class AxisChain:
-    """One axis: compensator, limiter, device, interlocks, and what it learns.
+    """One axis: compensator, limiter, device, interlocks, feedback and adaptation.
 
     Args:
-        plan: What the axis does.
-        device: Its open device.
-        lane: Where its blocks come from and go to.
+        plan: Plan of the axis.
+        device: Open device of the axis.
+        lane: Source and destination of its blocks.
         latency_blocks: Exchanges from a block's commands to its displacements.
 
     Attributes:
         block: Block of this tick.
         limiter: Limiter with the last command.
-        lead_in: What happens before the waveform.
+        lead_in: Initial ramp and conditioning before the waveform.
         invalid: Index of this tick's first requested command that is not finite, or -1.
         trip: Interlock that the last answer tripped.
-        guarded: Whether that ends the run.
-        no_room_at: First sample of the last answered block, if it had no room.
-        dropped: Samples that had no room.
+        guarded: Whether that trip ends the run.
+        no_room_at: First sample of the last answered block, if the ring had no room for it.
+        dropped: Samples dropped because the ring was full.
     """
 
     def __init__(
@@ -81,12 +81,12 @@ class AxisChain:
 
     @property
     def awaits_answer(self) -> bool:
-        """Whether a block that is to be recorded has no answer yet."""
+        """Whether a block to be recorded is still unanswered."""
         return bool(self._in_flight) and self._in_flight[0].due
 
     @property
     def next_answer(self) -> int | None:
-        """First sample of the block that is answered next; None if no block is under way."""
+        """First sample of the next block to be answered; None if none is outstanding."""
         return self._in_flight[0].head[_FIRST_SAMPLE] if self._in_flight else None
 
     @property
@@ -95,7 +95,7 @@ class AxisChain:
         return "" if self.plan.feedback is None else self.plan.feedback.against
 
     def named(self, text: str) -> str:
-        """Return a text with the name of the axis before it, if it has one."""
+        """Prefix a text with the name of the axis, if it has one."""
         return f"{self.plan.name}: {text}" if self.plan.name else text
 
     def begin_at(self, output: float) -> int:
@@ -110,7 +110,7 @@ class AxisChain:
         return self.lead_in.waveform_at
 
     def pass_over(self, start: int, stop: int) -> None:
-        """Feed the compensator the skipped samples ``start`` to ``stop`` of the waveform.
+        """Feed the skipped samples ``start`` to ``stop`` of the waveform to the compensator.
 
         Without them its input would jump, and the jump would appear in the command.
         """
@@ -173,7 +173,7 @@ class AxisChain:
         self.block.command[:] = self.limiter.limits.safe
 
     def send(self) -> None:
-        """Note that the block is about to be sent, so that it survives if the exchange fails."""
+        """Mark the block as being sent, so that it survives if the exchange fails."""
         self._in_flight.append(self.block)
         if self.block.due:
             self.lane.sending(self.block)
@@ -184,7 +184,7 @@ class AxisChain:
         early = len(in_flight) <= self._latency_blocks
         answered = sent if early else in_flight[0]
         head, before_ns = sent.head, now_ns()
-        # The wake-up alone would not show a delay by the work of this tick.
+        # The wake-up alone would not show a delay due to the work of this tick.
         head[_LATE_NS] = max(head[_LATE_NS], before_ns - deadline_ns)
         device = self.device
         device.exchange(first_sample, sent.command, answered.displacement_um, answered.measured)
@@ -194,9 +194,9 @@ class AxisChain:
         self._answered = None if early else in_flight.popleft()
 
     def take(self) -> bool:
-        """Check an answered block, learn from it, and pass it on to be recorded.
+        """Check an answered block, update feedback and adaptation, and pass it on to be recorded.
 
-        Return whether an interlock tripped or the block had no room.
+        Return whether an interlock tripped or the ring had no room for the block.
         """
         if (block := self._answered) is None:
             return False
@@ -218,7 +218,7 @@ class AxisChain:
     def remove_offset(self, sample: int) -> str:
         """Remove the offset between sensor and model; return why the run must end, if it must.
 
-        ``sample`` is the next one.
+        ``sample`` is the index of the next sample.
         """
         text, values, refused = self.lead_in.remove_offset()
         if self.plan.adaptation is not None:
@@ -259,7 +259,7 @@ class AxisChain:
             self.lane.record_event(event)
 
     def record_lost_readings(self, sample: int) -> None:
-        """Record how many readings of the sensor did not arrive."""
+        """Record the number of lost sensor readings."""
         ages = self.device.info.ages_readings
         if ages and (lost := cast(AgingDevice, self.device).lost_readings):
             text = f"{lost} readings of the sensor did not arrive"
@@ -267,7 +267,7 @@ class AxisChain:
             self.lane.record_event(Event(sample, "warning", LOST_READINGS, text, values))
 
     def safe_goal(self) -> SafeGoal:
-        """Return how to reach the safe value from the last command after a lost device."""
+        """Return the ramp from the last command to the safe value after a lost device."""
         limits = self.limiter.limits
         unanswered = not self.device.info.simulated
         return SafeGoal(limits.safe, limits.ramp_per_s, self.limiter.last, unanswered)
@@ -327,7 +327,7 @@ class AxisChain:
         self.lead_in.correct(input_um, start)
         if plan.feedback is not None:
             plan.feedback.follow(self.block, input_um)
-        # Last: it adds the adapted offset and gain, and learns from the input without them.
+        # Last: it adds the adapted offset and gain, and adapts to the input without them.
         if plan.adaptation is not None:
             plan.adaptation.follow(input_um, self._size)
 

@@ -11,7 +11,7 @@ from hilctl.models.base import HysteresisModel, Operator
 
 
 class Compensator:
-    """The inverse of a model, used by loop and replay; without a model it passes the input on."""
+    """Inverse of a model for loop and replay; without a model it passes the input through."""
 
     def __init__(self, model: HysteresisModel | None, sample_rate_hz: float) -> None:
         self._operator: Operator | None = model.inverse(sample_rate_hz) if model else None
@@ -55,13 +55,13 @@ class Compensator:
         self.restore(state)
 
     def state(self, out: F64 | None = None) -> F64:
-        """Return a copy of the hysteresis state: float64[state_size], in ``out`` if set."""
+        """Return a copy of the hysteresis state: float64[state_size], written to ``out`` if set."""
         if self._operator is None:
             return np.empty(0) if out is None else out
         return self._operator.state(out)
 
     def restore(self, state: F64) -> None:
-        """Restore a state of :meth:`state`; raise ModelError if it is of another model."""
+        """Restore a result of :meth:`state`; raise ModelError if it belongs to another model."""
         if self._operator is not None:
             self._operator.restore(state)
         elif state.size:

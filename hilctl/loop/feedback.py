@@ -2,10 +2,10 @@
 
 The PI controller compares the last displacement with the reference that was due then, and adds a
 correction to the compensator's input. Compensator and actuator together have a gain of about 1 and
-a delay, so the delay limits the bandwidth.
+a delay, which limits the bandwidth.
 
 The integral controller uses the mean error of each block, and works with every device, also with a
-FIFO. It removes offset, creep and drift, and nothing faster. The mean has little noise, and with a
+FIFO. It removes offset, creep and drift, but nothing faster. The mean has little noise, and with a
 bandwidth well below 1 / (2 pi times the loop's delay) no FIFO makes it oscillate.
 """
 
@@ -25,11 +25,11 @@ _INVERSE_OUT = int(Flag.INVERSE_OUT)
 
 
 class Controller(ABC):
-    """A controller that corrects the compensator's input; called in every tick, it never waits.
+    """A controller that corrects the compensator's input; called in every tick; it never blocks.
 
     Args:
         limit_um: Largest correction, > 0; the correction is always finite and within it.
-        shown_after: Steps of the integral from a correction to the displacement that contains it.
+        shown_after: Steps of the integral from a correction to the displacement that includes it.
     """
 
     def __init__(self, limit_um: float, shown_after: int) -> None:
@@ -138,10 +138,10 @@ class Polarity:
     """Detect a reversed sign of sensor or command.
 
     With a reversed sign the correction increases the error, and grows to its limit. Disturbances
-    can drive it there too. The sum of input and displacement separates both: with a reversed sign
-    it is constant, otherwise it moves twice as far as the input. It is observed from half of the
-    limit on, and evaluated after as many samples at the limit. ``shown_after`` is the number of
-    samples from a correction to the displacement that contains it.
+    can cause the same. The sum of input and displacement distinguishes both: with a reversed sign
+    it is constant, otherwise it moves twice as far as the input. It is observed when the correction
+    exceeds half of its limit, and evaluated after as many samples at the limit. ``shown_after`` is
+    the number of samples from a correction to the displacement that contains it.
     """
 
     def __init__(self, limit_um: float, shown_after: int) -> None:
@@ -194,7 +194,7 @@ class _Episode:
 
     @property
     def reversed(self) -> bool:
-        """Whether the sum moved at most half as far as the input."""
+        """Whether the sum moved at most half as far as the input did."""
         return self._sum_um[1] - self._sum_um[0] <= 0.5 * self.input_span_um
 
 
@@ -206,11 +206,11 @@ _LIMITED = int(Flag.RANGE_LIMITED | Flag.SLEW_LIMITED)
 
 
 MOST_GAIN_PER_BLOCK = 1.0
-"""Bound of the gain of :class:`IntegralFeedback`: a larger one overcorrects a gain of 1."""
+"""Bound of the gain of :class:`IntegralFeedback`: a larger one overcorrects at a gain of 1."""
 
 
 class IntegralFeedback(Controller):
-    """Integral controller for blocks; it steps once per block.
+    """Integral controller for blocks, updated once per block.
 
     Args:
         gain_per_block: um of correction per um of error and block, > 0.

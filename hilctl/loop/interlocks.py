@@ -47,12 +47,12 @@ class Trip:
 
 @dataclass(frozen=True, slots=True)
 class InterlockRequirement:
-    """What a key requires.
+    """Requirements of a key.
 
     Attributes:
         unit: Command unit of the device; None for either.
-        key: Another key; ``measured_deviation`` means the one of the device's unit.
-        reference_um: Whether a compensator is required, and thus a reference in um.
+        key: Another key; ``measured_deviation`` means the key for the device's unit.
+        reference_um: Whether a compensator, and thus a reference in um, is required.
         measured: Whether the device must measure its command.
     """
 
@@ -69,8 +69,8 @@ _NotNegative: TypeAlias = Annotated[float, Field(ge=0.0)]
 class InterlockSettings(StrictModel):
     """Settings of the interlocks: keys of an experiment's ``limits``; None disables an interlock.
 
-    A condition with a time trips after it has been true for longer without interruption. A missing
-    reading does not interrupt a condition on readings.
+    A condition with a time trips if it is true without interruption for longer than that time. A
+    missing reading does not interrupt a condition on readings.
     """
 
     rms_current_a: Annotated[
@@ -196,7 +196,7 @@ class Interlocks:
         self._interlock_block = compiled(kernels.interlock_block)
 
     def begin_at(self, command: float) -> None:
-        """Set the present output; the coil is at least as hot as this command keeps it."""
+        """Set the present output; the coil has at least the heat that this command causes."""
         memory = self._memory
         memory[kernels.COMMAND] = command
         memory[kernels.HEAT] = max(memory[kernels.HEAT], command**2)
@@ -245,7 +245,7 @@ class Interlocks:
         return self._trip(first_sample + k, flags.item(k), sent, seen)
 
     def _check_aux(self, block: Block) -> Trip | None:
-        """Check the auxiliary channels; a missing value may last as long as an invalid reading."""
+        """Check the auxiliary channels; a value may be missing as long as an invalid one."""
         for k, limit in self._aux:
             value = block.aux.item(k)
             if limit.low <= value <= limit.high:
@@ -268,7 +268,7 @@ class Interlocks:
         return Trip(sample, "aux", text)
 
     def _hold(self, samples: int) -> None:
-        """Account for skipped samples: the output and all conditions stay."""
+        """Account for skipped samples, during which the output and all conditions stay constant."""
         memory = self._memory
         rest = memory[kernels.COMMAND] ** 2
         cooling = (1.0 - self._numbers[kernels.WARMING]) ** samples
@@ -281,9 +281,10 @@ class Interlocks:
     def _trip(
         self, sample: int, bits: int, sent: tuple[float, float, float], seen: tuple[float, float]
     ) -> Trip:
-        """Return the trip; of several, a cause before its consequence.
+        """Return the trip; if there are several, a cause takes precedence over its consequence.
 
-        ``sent`` is command before, command, measured command; ``seen`` is reference, displacement.
+        ``sent`` is previous command, command, measured command; ``seen`` is reference,
+        displacement.
         """
         reference, displacement = seen
         settings = self.settings
@@ -341,12 +342,12 @@ class Interlocks:
 
 
 def warming(time_constant_s: float, sample_rate_hz: float) -> float:
-    """Return the share of the difference to its final heat that a coil gains per sample."""
+    """Return the fraction of the remaining heating of a coil that one sample adds."""
     return -math.expm1(-1.0 / (time_constant_s * sample_rate_hz))
 
 
 def for_longer_than(time_s: float | None) -> str:
-    """Return the words for the time an interlock allows; nothing if it allows none."""
+    """Return a text on the time that an interlock allows; empty if it allows none."""
     return f" for longer than {time_s:g} s" if time_s else ""
 
 

@@ -1,10 +1,10 @@
-"""The lead-in of a waveform: initial ramp, conditioning cycle, and the resting offset.
+"""The lead-in of a waveform: initial ramp, conditioning cycle, and offset at rest.
 
 The commands of the conditioning cycle are computed before the run, and pass the limiter. After the
 cycle the output rests at the safe value. The mean displacement at rest is compared with the
-model's, and the offset is subtracted from the compensator's input: a sensor or actuator that has
-moved since identification causes no error. For a sensor without a defined zero it is subtracted
-from the readings instead, and the actuator does not move.
+model's, and the offset is subtracted from the compensator's input: so a shift of sensor or actuator
+since the identification causes no error. For a sensor without a defined zero the offset is
+subtracted from the readings instead, and the actuator does not move.
 """
 
 import math
@@ -18,11 +18,11 @@ from hilctl.base.types import F64
 
 @dataclass(frozen=True, slots=True)
 class Conditioning:
-    """Commands before a waveform, and the measurement of the offset at rest.
+    """Commands before a waveform, and parameters for measuring the offset at rest.
 
     Attributes:
-        command: float64[m], requested commands, whole blocks; the last ones rest at the safe value.
-        rest: Start and stop of the samples at rest; those after it cover the device's latency.
+        command: float64[m], requested commands, whole blocks; the last commands are the safe value.
+        rest: Start and stop of the samples at rest; later samples cover the device's latency.
         cycle_samples: Samples of the cycle; 0 if there is only rest.
         stands_um: The model's displacement at rest, 0 without a model; None if no offset is
             measured.
@@ -81,7 +81,7 @@ class LeadIn:
         return Event(self.condition_at, "info", "condition", text, values)
 
     def condition(self, wanted: F64, sample: int) -> None:
-        """Fill requested commands, float64[n], from sample ``sample`` of the run on."""
+        """Fill in requested commands, float64[n], beginning with sample ``sample`` of the run."""
         assert self._conditioning is not None
         start = sample - self.condition_at
         wanted[:] = self._conditioning.command[start : start + wanted.size]
@@ -108,8 +108,8 @@ class LeadIn:
         """Compare the resting displacement with the model's, and remove the difference.
 
         Returns:
-            Text, empty if nothing was measured; values; whether the offset exceeds the limit, so
-            that the run must end.
+            Text (empty if nothing was measured), values, and whether the run must end because the
+            offset exceeds the limit.
         """
         conditioning = self._conditioning
         if conditioning is None or conditioning.stands_um is None:
@@ -121,7 +121,7 @@ class LeadIn:
         zero = conditioning.zero
         if not abs(offset_um) <= conditioning.largest_um:
             limit = f"an offset beyond {conditioning.largest_um:.4g} µm"
-            cure = "adjust the sensor" if zero else "identify the model anew"
+            cure = "adjust the sensor" if zero else "identify the model again"
             return f"{rests}: {limit}: {cure}", values, True
         target = "readings" if zero else "compensator's input"
         if zero:

@@ -1,4 +1,4 @@
-"""The limiter: range and slew of every command, last before the device; used by loop and replay."""
+"""The limiter: range and slew of every command, the last step before the device."""
 
 import math
 from dataclasses import dataclass
@@ -46,10 +46,10 @@ _BITS = int(Flag.RANGE_LIMITED), int(Flag.SLEW_LIMITED), int(Flag.INVALID)
 
 
 class Limiter:
-    """Limit commands; keeps the last one.
+    """Limiter of commands; it keeps the last command.
 
-    The last command may be set to the present output. If that is outside the limits, commands
-    return into the range with limited slew.
+    The last command may be set to the present output. If that output is outside the limits,
+    commands return into the range with limited slew.
     """
 
     def __init__(self, limits: CommandLimits, dt_s: float) -> None:

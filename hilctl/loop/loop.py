@@ -2,8 +2,8 @@
 
 A run has up to four parts: a ramp from the present output to the safe value, a conditioning cycle,
 the waveform, and the safe ramp. Each tick fills a block (reference, compensator, limiter),
-exchanges it with the device, and hands it to the host. Every regular end uses the same safe ramp:
-the end of the waveform, a stop, a fault.
+exchanges it with the device, and hands it to the host. The end of the waveform, a stop and a fault
+all use the same safe ramp.
 
 A device with a FIFO answers a block some ticks later. Blocks wait in their slots until then; after
 the ramp the loop repeats the safe value until the last answer has arrived.
@@ -89,7 +89,7 @@ class Loop:
         """Set the present outputs, before :meth:`run`.
 
         Args:
-            outputs: Command of each axis in its device's unit; may be outside the limits.
+            outputs: Command of each axis in the unit of its device; may be outside the limits.
 
         Returns:
             Samples before the waveform, whole blocks: the ramp to the safe values (none if each
@@ -150,8 +150,8 @@ class Loop:
     def _await_trigger(self, start_ns: int) -> int:
         """Wait for the digital input, if the plan says so; return the time of the first tick.
 
-        Nothing is written meanwhile, and the device's watchdog is not armed yet. A stop or the
-        timeout ends the run with its safe ramp.
+        During the wait nothing is written, and the device's watchdog is not armed yet. A stop or
+        the timeout ends the run with its safe ramp.
         """
         triggers, clock = self._plan.triggers, self._clock
         if triggers is None or not self._plan.waits:
@@ -318,8 +318,8 @@ class Loop:
     ) -> None:
         """Enter the safe ramp of all axes with the next block.
 
-        The first reason is the reason of the run. A fault replaces a completed waveform: the answer
-        that shows it may arrive after the end.
+        The first reason becomes the reason of the run. A fault after a completed waveform replaces
+        the outcome, because the answer that shows it may arrive after the end.
         """
         if self._phase not in _AFTER:
             self._phase = _LEAVING
@@ -331,7 +331,7 @@ class Loop:
             self._record_fault(event, reason, sample)
 
     def _record_fault(self, event: str, reason: str, sample: int | None) -> None:
-        """Record a fault as an event, only the first one of each kind."""
+        """Record the first fault of each kind as an event."""
         if event not in self._faults:
             self._faults.add(event)
             at = self._next_sample if sample is None else sample

@@ -1,4 +1,4 @@
-"""The pacer: absolute deadlines, policies for late ticks, and exact counters."""
+"""Pacer of the loop: absolute deadlines, policies for late ticks, and exact counters."""
 
 import ctypes
 import errno
@@ -43,7 +43,7 @@ class SystemClock:
     """CLOCK_MONOTONIC with sleeps to an absolute time."""
 
     def __init__(self) -> None:
-        self._nanosleep = ctypes.CDLL(None).clock_nanosleep  # returns its error, not in errno
+        self._nanosleep = ctypes.CDLL(None).clock_nanosleep  # returns its error, sets no errno
         self._spec = _Timespec()
         self._pointer = ctypes.byref(self._spec)
 
@@ -53,7 +53,7 @@ class SystemClock:
     def sleep_until_ns(self, deadline_ns: int) -> None:
         """Sleep until a time; return immediately if it has passed."""
         if deadline_ns <= self.now_ns():
-            return  # faster than a call of the kernel
+            return  # faster than a system call
         self._spec.tv_sec, self._spec.tv_nsec = divmod(deadline_ns, 1_000_000_000)
         while True:
             code = self._nanosleep(time.CLOCK_MONOTONIC, _TIMER_ABSTIME, self._pointer, None)
@@ -79,12 +79,12 @@ class LateRules:
     """When a tick counts as late, and when lateness ends a run.
 
     Attributes:
-        late_after_ns: Lateness from which a tick counts as late.
+        late_after_ns: Smallest lateness that counts as late.
         max_late_ns: Lateness that ends the run.
         max_consecutive_late: Consecutive late ticks that end the run; 0: any number is allowed.
-        missed_window: Number of last ticks in which misses are counted.
-        max_missed: Skipped ticks allowed in that window; more end the run if they are due to at
-            least five stalls.
+        missed_window: Number of latest ticks in which misses are counted.
+        max_missed: Skipped ticks allowed in that window; more ticks end the run if at least five
+            stalls caused them.
     """
 
     late_after_ns: float = math.inf
@@ -99,11 +99,11 @@ class Pacer:
 
     Args:
         period_ns: Period of the ticks; may be fractional.
-        policy: What follows a tick that is a period or more late; may be changed between ticks.
+        policy: Reaction to a tick that is a period or more late; may be changed between ticks.
             ``skip``: skip ticks to keep the phase. ``catch_up``: run all ticks. ``follow``: the
             exchange waits for the device's clock, and the deadlines follow that clock. ``spaced``,
             for the start of a run: each tick waits a whole period after the end of the previous
-            one, so two writes are never closer, however long an exchange took.
+            tick, so writes are at least a period apart, however long an exchange took.
     """
 
     def __init__(
@@ -119,7 +119,7 @@ class Pacer:
         self._not_kept = ""
         self._least_counted_ns = 0.0
         self.late_run = 0
-        """Consecutive late ticks up to this one."""
+        """Consecutive late ticks up to the present one."""
         self.tick = -1
         self.deadline_ns = 0
         """Deadline of the present tick."""
@@ -185,7 +185,7 @@ class Pacer:
             self._not_kept = f"timing not kept: {share}, {allowed}: {TIMING_REMEDY}"
 
     def _follow(self) -> None:
-        """Follow the device's clock: immediately if it is early, slowly if it is late."""
+        """Follow the device's clock: adjust immediately if it is early, slowly if it is late."""
         self.late_ns = self._clock.now_ns() - self.deadline_ns
         if self.late_ns < 0:
             self._origin_ns += self.late_ns

@@ -1,4 +1,4 @@
-"""The plan of a run, and the host that a loop runs in."""
+"""Plan of a run, and interface of the host that a loop runs in."""
 
 from collections.abc import Sequence
 from dataclasses import dataclass, field
@@ -44,14 +44,14 @@ class AxisPlan:
 
 @dataclass(frozen=True, slots=True)
 class LoopPlan:
-    """The plan of a run: what all axes have in common, and that of each axis.
+    """The plan of a run: common settings, and the plan of each axis.
 
     Attributes:
         block: Samples per exchange.
         latency_blocks: Exchanges from a block's commands to its displacements.
         late_policy: Policy for late ticks in waveform and safe ramp. If the host paces the device,
             ``skip``: otherwise the ramp would take long on a slow one.
-        keep_all: Whether a block that is dropped because the ring is full ends the run.
+        keep_all: Whether dropping a block because the ring is full ends the run.
     """
 
     axes: tuple[AxisPlan, ...]
@@ -80,7 +80,7 @@ class LoopPlan:
 
 
 class Lane(Protocol):
-    """Where the blocks and events of one axis come from and go to."""
+    """Source and destination of the blocks and events of one axis."""
 
     def claim(self, *, due: bool = True) -> Block:
         """Return the next block; a spare slot if it is not due, or if the ring is full.
@@ -90,7 +90,7 @@ class Lane(Protocol):
         ...
 
     def sending(self, block: Block) -> None:
-        """Note that a block is about to be sent, so that it is never lost."""
+        """Mark a block as being sent, so that it is never lost."""
         ...
 
     def answered(self, block: Block) -> bool:
@@ -98,7 +98,7 @@ class Lane(Protocol):
         ...
 
     def writing_safe(self, value: float) -> None:
-        """Note a write of the safe ramp, so that another process can continue it."""
+        """Publish a write of the safe ramp, so that another process can continue the ramp."""
         ...
 
     def record_event(self, event: Event) -> None:
@@ -107,7 +107,7 @@ class Lane(Protocol):
 
 
 class Host(Protocol):
-    """Clock, lanes, and supervision; no call except the clock's sleep may block."""
+    """Clock, lanes, and supervision; only the clock's sleep may block."""
 
     @property
     def clock(self) -> Clock:
@@ -120,20 +120,20 @@ class Host(Protocol):
         ...
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
-        """Write the heartbeat, once per tick; return the reason to stop, or an empty text.
+        """Write the heartbeat, once per tick; return the reason for a stop, or an empty text.
 
         ``next_sample`` is an index in the waveform; 0 before it begins.
         """
         ...
 
     def starts_at(self, time_ns: int) -> None:
-        """Note the time of the first tick, before it, of a run that has waited for a trigger."""
+        """Publish the time of the first tick, before it, in a run that has waited for a trigger."""
         ...
 
     def closing(self) -> None:
-        """Note that the loop has ended; closing the device may take its timeouts."""
+        """Publish that the loop has ended; closing the device may take as long as its timeouts."""
         ...
 
     def tuning(self) -> Tuning | None:
-        """Return a requested change that begins now, each one once."""
+        """Return a requested change that begins now; each change is returned once."""
         ...

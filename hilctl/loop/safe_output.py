@@ -17,7 +17,7 @@ from hilctl.base.errors import DeviceError, UnconfirmedError
 OutputState: TypeAlias = Literal["confirmed", "set", "sent", "unknown"]
 """State of the output at the end of a run.
 
-``confirmed``: the device confirmed the safe value, and no older command can follow.
+``confirmed``: the device confirmed the safe value, and no older command can still be executed.
 ``set``: the device confirmed the safe value, but an unconfirmed older one may still be executed.
 ``sent``: the safe value was sent to a device that cannot confirm it.
 ``unknown``: the safe value is not confirmed.
@@ -26,13 +26,13 @@ OutputState: TypeAlias = Literal["confirmed", "set", "sent", "unknown"]
 Code: TypeAlias = Literal["completed", "stopped", "fault"]
 
 PATIENCE_S = 4.0
-"""How long a command waits for confirmation before the guardian takes over."""
+"""Time that a command waits for confirmation before the guardian takes over."""
 _RAMP_S = 0.005
 _RETRY_S = 0.05
 _LATER_RETRY_S = 0.5
 _REPEAT_S = 0.2
 PATIENT_AFTER_S = 60.0
-"""How long the safe value is repeated quickly."""
+"""Time during which the safe value is repeated quickly."""
 PATIENT_PAUSE_S = 1.0
 """Pause between two attempts after that."""
 _SENDS = 5
@@ -78,7 +78,7 @@ class LoopOutcome:
 
 
 class LocalError(Exception):
-    """This process lacks memory or descriptors to drive the device; another process may not."""
+    """This process lacks memory or descriptors for the device; another process may have them."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -123,7 +123,7 @@ class SafeOutput:
     ) -> None:
         self._device, self._goal = device, goal
         if device.info.digital_output:
-            # Not with its first write, because the safe ramp must not wait for it.
+            # Not with the first write, because the safe ramp must not wait for it.
             cast(DigitalDevice, device).safe_command = goal.value
         self._clock, self._on_write = clock, on_write
         self.pending = goal.pending
@@ -221,7 +221,7 @@ _WORST: tuple[OutputState, ...] = ("unknown", "sent", "set", "confirmed")
 
 
 def joint_state(outputs: Sequence[SafeOutput], names: Sequence[str]) -> tuple[OutputState, str]:
-    """Return the worst state of several outputs, and why those in it are not confirmed."""
+    """Return the worst state of several outputs, and why those outputs are not confirmed."""
     state = min((each.state for each in outputs), key=_WORST.index)
     whys = [
         f"{name}: {each.error}" if name and each.error else each.error
@@ -240,7 +240,7 @@ def drive_all_to_safe(
 ) -> list[SafeOutput]:
     """Drive each device to its safe value; none waits for the timeouts of another one.
 
-    See :func:`drive_to_safe` for the arguments, of which the sequences have one per device.
+    See :func:`drive_to_safe` for the arguments; sequences have one item per device.
     """
     outputs = list(zip(devices, goals, on_writes, strict=True))
     if len(outputs) == 1:

@@ -16,8 +16,8 @@ MarkKind: TypeAlias = Literal["cycle", "segment", "run"]
 Level: TypeAlias = Literal["high", "low"]
 
 SHORTEST_CYCLE = 2
-"""Shortest distance of marks in samples: the output is high for one and low for one."""
-_ROUNDING = 1e-6  # of a sample: must not add a cycle, or delay one
+"""Shortest distance of marks in samples: the output is high for one sample and low for one."""
+_ROUNDING = 1e-6  # of a sample: rounding must not add or delay a cycle
 
 
 @dataclass(frozen=True, slots=True)
@@ -25,9 +25,9 @@ class Triggers:
     """Triggers of a run.
 
     Attributes:
-        marks: int64[m], samples of the waveform with which the digital output is set, in order.
+        marks: int64[m], samples of the waveform at which the digital output is set, in order.
         start: Level of the digital input that starts the run; None: the run starts immediately.
-        timeout_s: Longest wait for it.
+        timeout_s: Longest wait for this level.
     """
 
     marks: I64
@@ -35,17 +35,17 @@ class Triggers:
     timeout_s: float = math.inf
 
     def pulses(self, device: DigitalDevice, waveform_at: int) -> "PulseOutput | None":
-        """Return the digital output of a run, whose waveform begins at a sample; None without."""
+        """Return the digital output of a run by the waveform's first sample; None without marks."""
         return PulseOutput(device, self.marks + waveform_at) if self.marks.size else None
 
 
 def marks_of(kind: MarkKind | None, segments: Iterable[Segment]) -> I64:
-    """Return the first samples of the waveform, its segments or their cycles, int64[m]."""
+    """Return the first sample of the waveform, of each segment or of each cycle: int64[m]."""
     starts = [each.start for each in segments]
     if kind != "cycle":
         return np.array([] if kind is None else starts[:1] if kind == "run" else starts, np.int64)
     periodic = [each for each in segments if each.period > 0.0]
-    # A cycle begins between two samples as a rule, and needs a sample of its segment.
+    # A cycle usually begins between two samples, and its mark must lie in its segment.
     ends = [each.stop - 1 + _ROUNDING for each in periodic]
     cycles = [np.arange(e.start, end, e.period) for e, end in zip(periodic, ends, strict=True)]
     return np.ceil(np.concatenate([*cycles, []]) - _ROUNDING).astype(np.int64)

@@ -1,6 +1,6 @@
 """Smooth changes of a running reference's gain and offset, and of the inverse's share.
 
-The inverse is bypassed and enabled by a crossfade between its command and that of a straight line.
+A crossfade between the command of the inverse and a straight line bypasses and enables the inverse.
 The compensator is fed all the time, so that its state is correct when it is enabled again. Feedback
 and adaptation pause meanwhile (:attr:`Flag.INVERSE_OUT`): feedback would drive its correction,
 which is not applied, to the limit, and adaptation would take the line for a change of the actuator.
@@ -35,8 +35,9 @@ class Tuning:
 
     Attributes:
         samples: Duration of the change.
-        begins_at: First sample of the change; if it has passed, the next block.
-        inverse_share: Share of the inverse in the command, 0 to 1; the rest is the line's.
+        begins_at: First sample of the change; if it is in the past, the change begins with the next
+            block.
+        inverse_share: Share of the inverse in the command, 0 to 1; the line has the rest.
     """
 
     gain: float
@@ -56,9 +57,9 @@ class TuningFactors(NamedTuple):
 
 
 def interpolate(before: float, after: float, part: T) -> T:
-    """Return the value at a part (0 to 1) of a change.
+    """Return the value at a fraction (0 to 1) of a change.
 
-    It depends on the sample's number only, so the result is the same for any block size. It is
+    It depends only on the index of the sample, so the result is the same for any block size. It is
     exact at both ends.
     """
     return before * (1.0 - part) + after * part
@@ -151,8 +152,8 @@ def crossfade(
 ) -> None:
     """Crossfade commands of the inverse with those of a straight line, in place.
 
-    All arrays are of n samples; the reference is in um. No bit changes where the share of the
-    inverse is 1; ``INVERSE_OUT`` is set for all other samples.
+    All arrays are of n samples; the reference is in um. Commands with a share of 1 keep all bits;
+    ``INVERSE_OUT`` is set for all other samples.
     """
     out = np.broadcast_to(share < 1.0, wanted.shape)
     straight = line.slope * reference + line.at_zero
