@@ -1,6 +1,6 @@
-"""Metrics of an output-input loop and of its sensor noise: pure functions of arrays.
+"""Metrics of a hysteresis loop and its sensor noise: pure functions of arrays.
 
-Metrics use one mean cycle, because sensor noise would otherwise dominate every maximum; the
+Metrics use one mean cycle, because sensor noise would otherwise dominate every maximum. The
 remaining noise sets a floor for the peak hysteresis. An undefined metric (no output, no second
 branch) is None.
 """
@@ -26,7 +26,7 @@ _WIDEST_HOLE = 0.05
 _FEWEST_BINS = 4
 _ORDER = 6
 NOISE_OVERLAP = _ORDER
-"""Samples before a part that its first noise windows need."""
+"""Samples before a piece that its first noise windows need."""
 _GAIN = 924.0**0.5  # of white noise: the root of binomial(12, 6)
 _FEWEST_WINDOWS = 32
 
@@ -47,7 +47,7 @@ class MeanCycle:
 
     @property
     def whole(self) -> bool:
-        """Whether the bins cover the cycle without a gap of more than 5 % and one missing bin."""
+        """Whether no gap of the bins is larger than 5 % of the cycle plus one missing bin."""
         bins = self.phase.size
         if bins < _FEWEST_BINS:
             return False
@@ -58,9 +58,9 @@ class MeanCycle:
 class CycleAverager:
     """Incremental mean of cycles of paired signals on phase bins.
 
-    A sample's phase is its index modulo the period, > 0 samples, not necessarily whole, so that
-    gaps are allowed. All signals of a sample go to the same bin, so their means stay paired. There
-    is at most one bin per sample of a period; empty bins and samples with a non-finite signal are
+    A sample's phase is its index modulo the period, > 0 samples, not necessarily whole, so gaps are
+    allowed. All signals of a sample are added to the same bin, so their means stay paired. There is
+    at most one bin per sample of a period; empty bins and samples with a non-finite signal are
     skipped.
     """
 
@@ -124,7 +124,7 @@ class BranchGap:
 
 
 def widest_gap(loop_input: F64, output: F64) -> BranchGap | None:
-    """Return the largest distance of rising and falling branches of a closed loop (figure 2.4).
+    """Return the largest gap between rising and falling branches of a closed loop (figure 2.4).
 
     Input and output are float64[m], one cycle in order of phase. The loop is split where its input
     turns. At every input each rising branch is compared with each falling one, with linear
@@ -231,9 +231,9 @@ def sensor_noise_um(index: I64, displacement_um: F64) -> float | None:
 
     The noise is the residual of seven neighbouring samples from a polynomial of degree 5 (their
     sixth difference, scaled to gain 1 for white noise); for an 83 um sine at 250 Hz and 50 kHz that
-    is 1 pm. The median magnitude ignores spikes, steps and the corners of a triangle. Low-passed
-    noise is underestimated: by 13 % at a bandwidth of 0.3 times the sample rate. Windows with a gap
-    of the sample index, int64[n], or a reading that is not finite are skipped.
+    is 1 pm. The median magnitude is insensitive to spikes, steps and the corners of a triangle.
+    Low-passed noise is underestimated: by 13 % at a bandwidth of 0.3 times the sample rate. Windows
+    with a gap of the sample index, int64[n], or a reading that is not finite are skipped.
     """
     finite = np.isfinite(displacement_um)
     windows = noise_windows_um(index[finite], displacement_um[finite])
@@ -241,13 +241,13 @@ def sensor_noise_um(index: I64, displacement_um: F64) -> float | None:
 
 
 def noise_windows_um(index: I64, displacement_um: F64) -> F64:
-    """Return the magnitude of the residual of each window without a gap: float64[m], m <= n - 6."""
+    """Return the residual magnitude of each window without a gap: float64[m], m <= n - 6."""
     unbroken = index[_ORDER:] - index[:-_ORDER] == _ORDER
     return np.asarray(np.abs(np.diff(displacement_um, _ORDER)[unbroken]))
 
 
 def noise_of(median_um: float, windows: int) -> float | None:
-    """Return the rms noise from the median of :func:`noise_windows_um`; None for few windows."""
+    """Return the rms noise from a median of :func:`noise_windows_um`; None for too few windows."""
     return MAD_TO_SIGMA * median_um / _GAIN if windows >= _FEWEST_WINDOWS else None
 
 

@@ -66,7 +66,7 @@ class SegmentMetrics:
 
     @np.errstate(over="ignore", invalid="ignore")
     def metrics(self, noise_um: float | None = None) -> dict[str, float]:
-        """Return the metrics by name, those that are available."""
+        """Return the available metrics by name."""
         cycle, raw = self.cycle(), self.raw()
         found: dict[str, float | None] = {}
         if cycle is not None and cycle.whole:
@@ -93,6 +93,6 @@ class SegmentMetrics:
 
 
 def _percents(raw: dict[str, float], whole_um: float) -> tuple[float | None, float | None]:
-    """Return peak and rms error in percent; None without errors, or of no motion."""
+    """Return peak and rms error in percent; None without errors or motion."""
     peak, rms = (percent(raw.get(f"{name}_error_um", 0.0), whole_um) for name in ("peak", "rms"))
     return peak, rms

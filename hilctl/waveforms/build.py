@@ -1,4 +1,4 @@
-"""Build a complete reference: shapes, soft starts and ends, sequences, segments."""
+"""Builder of complete references: shapes, soft starts and ends, sequences, segments."""
 
 import math
 from collections.abc import Sequence
@@ -31,7 +31,7 @@ def read_samples(w: spec.FileWaveform, sample_rate_hz: float, folder: Path) -> t
     try:
         found = path.is_file()
     except OSError as error:  # a name that is too long
-        raise InputError(f"{path}: can't be read: {reason(error)}") from None
+        raise InputError(f"{path}: cannot be read: {reason(error)}") from None
     if not found:
         raise InputError(no_such_file(path))
     raw, own_rate_hz = _read(w, path)
@@ -40,7 +40,7 @@ def read_samples(w: spec.FileWaveform, sample_rate_hz: float, folder: Path) -> t
     period = 0.0 if w.period_s is None else w.period_s * sample_rate_hz
     if w.period_s is not None and period < SHORTEST_PERIOD:
         least_s = SHORTEST_PERIOD / sample_rate_hz
-        raise InputError(f"{path}: period_s must be {least_s:g} or more, a sample: {w.period_s!r}")
+        raise InputError(f"{path}: period_s must be >= {least_s:g}, one sample: {w.period_s!r}")
     return values, period
 
 
@@ -101,7 +101,7 @@ def _read(w: spec.FileWaveform, path: Path) -> tuple[F64, float | None]:
         raise InputError(f"{path}: {error}") from None
     if time is not None:
         own_rate_hz, _ = rows.sample_grid(1, _TIME_TOLERANCE, table.unit(time)[1])
-    if path.suffix.lower() == ".mcap":  # its references may be in A or V
+    if path.suffix.lower() == ".mcap":  # references of a recording may be in A or V
         factor = 1.0
     elif w.unit is not None and base not in {"", w.unit} and w.scale == 1.0:
         raise InputError(
@@ -137,9 +137,9 @@ class Reference:
 
     Attributes:
         values: float64[n], read-only, in ``unit``.
-        segments: Its waveforms with their steady parts.
+        segments: Segments of the waveforms, with their steady samples.
         span: Lowest and highest value.
-        repeats: Periodic parts of a long one.
+        repeats: Periodic parts of a long reference.
     """
 
     values: F64
@@ -167,7 +167,7 @@ class _Part:
 def build(
     waveform: spec.AnyWaveform, sample_rate_hz: float, folder: Path, rest: float = 0.0
 ) -> Reference:
-    """Compute every sample of a waveform; ``rest`` is the default of its key of that name.
+    """Compute every sample of a waveform; ``rest`` is the default of its key ``rest``.
 
     Raise InputError if a file is not usable, the waveform is too long, a soft start does not fit, a
     frequency is not below half the sample rate, or a value is too large for a float.
@@ -194,7 +194,7 @@ def build(
 
 
 def _repeats(parts: list[_Part], repeat: int) -> tuple[RepeatedPart, ...]:
-    """Return the periodic parts of a long reference: all of it, or the steady parts."""
+    """Return the periodic parts of a long reference: the whole reference, or its steady parts."""
     once = sum(part.values.size for part in parts)
     if repeat > 1:
         return (RepeatedPart(0, repeat * once, float(once)),)

@@ -1,4 +1,4 @@
-"""Samples of one waveform, as pure functions of time."""
+"""Samples of a single waveform, as pure functions of time."""
 
 import math
 from dataclasses import dataclass
@@ -15,14 +15,14 @@ MAX_SAMPLES = 100_000_000
 """Longest waveform in samples: 0.8 GB, 33 minutes at 50 kHz."""
 
 LONG = 400_000
-"""Samples above which a periodic waveform is checked by representative parts."""
+"""Length in samples above which only representative parts of a periodic waveform are checked."""
 
 _TELLING_CYCLES = 8
 _LONGEST_PERIOD = 2**31  # samples; products must fit an integer
 
 
 def sample_count(duration_s: float, sample_rate_hz: float) -> int:
-    """Return the samples of a duration, at least 1; raise InputError beyond :data:`MAX_SAMPLES`."""
+    """Return the samples in a duration, at least 1; raise InputError beyond :data:`MAX_SAMPLES`."""
     check_length(duration_s * sample_rate_hz)
     return max(1, round(duration_s * sample_rate_hz))
 
@@ -104,8 +104,9 @@ class _Instants:
     def cycles(self, frequency_hz: float) -> F64:
         """Return the phase of a frequency in cycles: float64[n], 0 to 1.
 
-        Frequency and rate are decimal numbers as written, so that each period of a whole number of
-        samples has the same bits. Rounded times would make every cycle differ slightly, like noise.
+        Frequency and rate are used as the decimal numbers that the user wrote, so that all periods
+        of a whole number of samples have the same bits. With rounded times every cycle would differ
+        slightly, like noise.
         """
         turn = _decimal(frequency_hz) / _decimal(self.rate_hz) % 1
         if turn.denominator > _LONGEST_PERIOD:
@@ -115,7 +116,7 @@ class _Instants:
 
 
 def _period(w: spec.ShapeOfTime, sample_rate_hz: float) -> int:
-    """Return the samples after which the bits repeat; 0 if never or too late."""
+    """Return the number of samples after which all bits repeat; 0 if never or too late."""
     match w:
         case spec.Sine() | spec.Triangle():
             common = [w.frequency_hz]
@@ -209,7 +210,7 @@ def _step(w: spec.Step, t: F64) -> F64:
 def _multisine(w: spec.Multisine, at: _Instants) -> F64:
     """Return evenly spaced sines with Schroeder phases, unscaled: float64[n].
 
-    Source: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970) 85: phases of a low crest
+    Source: M. R. Schroeder, IEEE Trans. Information Theory 16 (1970) 85: phases with a low crest
     factor, ``phi_m = -pi m (m - 1) / M``.
     """
     count = _multisine_count(w)
@@ -238,7 +239,7 @@ def telling_samples(period: float) -> int:
 
 
 def _random(w: spec.RandomSines, size: int) -> F64:
-    """Return sines of random phases at all multiples of 1 / duration within the band: float64[n].
+    """Return sines with random phases at all multiples of 1 / duration within the band: float64[n].
 
     The sum is an inverse FFT, because the number of sines grows with the duration.
     """
@@ -274,8 +275,8 @@ def _decimal(value: float) -> Fraction:
 def common_period_s(frequencies_hz: list[float]) -> float:
     """Return the shortest period that all frequencies share, in s.
 
-    Frequencies are decimal numbers as written, so 0.1 and 0.3 Hz share 10 s. Infinite if it is too
-    long for a float.
+    Frequencies are used as the decimal numbers that the user wrote, so 0.1 and 0.3 Hz share 10 s.
+    Infinite if the period is too long for a float.
     """
     fractions = [_decimal(f) for f in frequencies_hz]
     periods = math.lcm(*(each.denominator for each in fractions))

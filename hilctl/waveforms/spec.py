@@ -44,7 +44,7 @@ AtLeastOne = Field(json_schema_extra={"minItems": 1})
 
 
 class _Shape(StrictModel):
-    """Keys of every kind of waveform."""
+    """Keys common to all kinds of waveform."""
 
     unit: WaveformUnit | None = Field(default=None, description=UNIT)
     offset: float = Field(default=0.0, description="constant added to the waveform, in unit")
@@ -150,7 +150,7 @@ class Step(_Shape):
 
 
 class Hold(_Shape):
-    """One level."""
+    """A constant level."""
 
     kind: Literal["hold"]
     level: float = Field(description="level without offset, in unit")
@@ -177,7 +177,7 @@ class Multisine(_Shape):
 
 
 class RandomSines(_Shape):
-    """Equal sines of random phases over a whole band, scaled to a peak amplitude.
+    """Equal sines with random phases over a whole band, scaled to a peak amplitude.
 
     Its period is its duration.
 
