@@ -70,14 +70,14 @@ class Operator:
         )
 
     def __call__(self, signal: npt.ArrayLike) -> F64:
-        """Process one block of any numbers; raise ModelError if it is not a sequence of numbers."""
+        """Process one block of numbers of any type; raise ModelError if it is not 1-D."""
         block = np.ascontiguousarray(signal, dtype=np.float64)
         if block.ndim != 1:
             raise ModelError(f"the signal must be one sequence of numbers: shape {block.shape}")
         return self.process(block)
 
     def process(self, block: F64, out: F64 | None = None) -> F64:
-        """Process a contiguous block, float64[n], into ``out`` or a new array, and return that."""
+        """Process a contiguous block, float64[n]; return the result, in ``out`` or a new array."""
         if out is None:
             out = np.empty_like(block)
         if self.input_offset != 0.0:
@@ -97,7 +97,7 @@ class Operator:
         return out
 
     def restore(self, state: F64) -> None:
-        """Restore a state of :meth:`state`; raise ModelError if it is of another model."""
+        """Restore a result of :meth:`state`; raise ModelError if it belongs to another model."""
         if state.shape != self._memory.shape:
             raise ModelError(
                 f"state must have {self._memory.size} values, as this model's memory has: "
@@ -108,15 +108,15 @@ class Operator:
         self._memory[:] = state
 
     def keep_in(self, memory: F64) -> None:
-        """Move the memory into a given array."""
+        """Move the memory into an array."""
         memory[:] = self._memory
         self._memory = memory
 
     def stand(self, seconds: float) -> None:
-        """Let time pass at constant input, which only affects creep."""
+        """Let time pass at constant input; only creep changes the output meanwhile."""
 
     def reset(self, first_input: float | None = None) -> None:
-        """Start from rest, or from a signal that began with ``first_input``."""
+        """Reset to rest, or to the start of a signal that begins with ``first_input``."""
         self._memory[:] = self._rest
         if first_input is not None:
             self.process(np.array([first_input]))
@@ -128,22 +128,22 @@ STROKES: Mapping[str, float] = {
     "quarter stroke": 0.25,
     "tenth stroke": 0.1,
 }
-"""Classes of motions: peak-to-peak, of the range that a model was identified on."""
+"""Classes of motions: peak-to-peak values relative to the identified range of a model."""
 SMALLEST_STROKE = 0.05
 """Smallest motion of the last class."""
 
 
 def stroke_class(part: float) -> str:
-    """Return the class of a motion, given as a part of the range: the nearest by ratio."""
+    """Return the class of a motion relative to the range: the nearest one by ratio."""
     return min(STROKES, key=lambda name: abs(math.log(part / STROKES[name])))
 
 
 class IdentifiedRange(StrictModel):
-    """The motions that a model was identified on; beyond them its error is unknown.
+    """The motions on which a model was identified; outside them its error is unknown.
 
     Attributes:
         peak_to_peak_um: Smallest and largest peak-to-peak displacement.
-        frequency_hz: Lowest fundamental, and highest frequency of a command.
+        frequency_hz: Lowest fundamental frequency, and highest frequency of a command.
         speed_um_per_s: Largest speed.
     """
 
@@ -195,17 +195,17 @@ class HysteresisModel(CheckedModel, ABC):
     Attributes:
         kind: Registered name of the class.
         input_unit: Unit of the command, ``A`` or ``V``.
-        input_range: Lowest and highest command the model was identified on.
-        output_range_um: Lowest and highest displacement it was identified on; a reference beyond
-            them is rejected.
+        input_range: Lowest and highest command of the identification.
+        output_range_um: Lowest and highest displacement of the identification; a reference outside
+            is rejected.
         output_offset_um: Displacement at which the operators' output is 0.
         provenance: Origin of the parameters.
     """
 
     STANDALONE: ClassVar[bool] = True
-    """Whether a run can use it by itself; otherwise it is part of a staged model."""
+    """Whether a run can use the model directly; otherwise only as part of a staged model."""
     STAGEABLE: ClassVar[bool] = False
-    """Whether it can be the hysteresis of a staged model."""
+    """Whether the model can be the hysteresis of a staged model."""
 
     kind: str
     input_unit: CommandUnit = "A"
@@ -216,7 +216,7 @@ class HysteresisModel(CheckedModel, ABC):
 
     @classmethod
     def described_by(cls, data: Any) -> "type[HysteresisModel]":
-        """Return the class of the kind that a mapping names; raise InputError as ``kinds.load``."""
+        """Return the class of a mapping's ``kind``; raise InputError as ``kinds.load`` does."""
         if cls is not HysteresisModel:
             return cls
         found: type[HysteresisModel] = kinds.load(kinds.MODELS, data["kind"])
@@ -254,7 +254,7 @@ class HysteresisModel(CheckedModel, ABC):
         return self
 
     def __str__(self) -> str:
-        return repr(self)  # that of pydantic lists all numbers
+        return repr(self)  # the message of pydantic lists all numbers
 
     @abstractmethod
     def forward(self, sample_rate_hz: float) -> Operator:
@@ -262,10 +262,10 @@ class HysteresisModel(CheckedModel, ABC):
 
     @abstractmethod
     def inverse(self, sample_rate_hz: float) -> Operator:
-        """Return the operator from um to command, at rest; raise ModelError if there is none."""
+        """Return the operator from um to command, at rest; raise ModelError without an inverse."""
 
     def earlier(self) -> "HysteresisModel | None":
-        """Return the model with its inverse of an earlier version, for replays; None if equal."""
+        """Return the model with the inverse of an earlier version, for replays; None if equal."""
         return None
 
     @property
@@ -290,11 +290,11 @@ class HysteresisModel(CheckedModel, ABC):
 
 
 InnerModel: TypeAlias = Annotated[HysteresisModel, PlainSerializer(HysteresisModel.to_mapping)]
-"""A model as a part of another one."""
+"""A model as part of another model."""
 
 
 def threshold_problems(name: str, thresholds: Thresholds, *, sign: int = 1) -> Iterator[str]:
-    """Yield thresholds that do not move away from 0; indices count from 1."""
+    """Yield problems of thresholds that do not move away from 0; indices count from 1."""
     last = 0.0
     order = "rise from 0" if sign > 0 else "fall from 0"
     for i, threshold in enumerate(thresholds, start=1):
@@ -307,13 +307,13 @@ def threshold_problems(name: str, thresholds: Thresholds, *, sign: int = 1) -> I
 
 
 def length_problems(name: str, values: Weights, thresholds: Thresholds) -> Iterator[str]:
-    """Yield a mismatch of the numbers of weights and thresholds."""
+    """Yield a problem if the numbers of weights and thresholds differ."""
     if len(values) != len(thresholds):
         yield f"{name} must have one value per threshold: {len(values)} for {len(thresholds)}"
 
 
 def play_weight_problems(direct: float, weights: Weights) -> Iterator[str]:
-    """Yield broken conditions for the inverse of a sum of plays (5.5, 5.10)."""
+    """Yield violated conditions for the inverse of a sum of plays (5.5, 5.10)."""
     if not direct > 0.0:
         yield f"a_0 must be > 0 for the inverse to exist: {direct!r}"
     for i, weight in enumerate(weights, start=1):

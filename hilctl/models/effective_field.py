@@ -1,4 +1,4 @@
-"""The effective-field model: plays and drags of a field, a curve, eddy-current losses."""
+"""The effective-field model: plays and drags of a field, an output curve, eddy-current losses."""
 
 import math
 from collections.abc import Callable, Iterator
@@ -19,7 +19,7 @@ from hilctl.models.literature.preisach import (
 
 _TOLERANCE_UM = 1e-6
 _EVEN = 1e-3
-_SHORTEST, _LONGEST = 1e-12, 1e3  # relative lags and delays outside have nearly the same effect
+_SHORTEST, _LONGEST = 1e-12, 1e3  # relative lags and delays outside have a similar effect
 
 Time = Annotated[float, Field(ge=0.0, le=1.0)]
 NotNegative = Annotated[float, Field(ge=0.0, allow_inf_nan=False)]
@@ -39,8 +39,8 @@ def final_weight(lags: F64, decays: F64) -> F64:
 
     Args:
         lags: Lag for small, slow changes, relative to the interval: float64[n].
-        decays: Delay of the losses, relative to the interval: float64[n]. Losses that a change
-            causes after the interval do not count.
+        decays: Delay of the losses, relative to the interval: float64[n]. Losses after the interval
+            due to a change in it do not count.
     """
     decays = np.maximum(decays, _SHORTEST)
     within = np.clip(lags * (1.0 + decays * np.expm1(-1.0 / decays)), _SHORTEST, _LONGEST)
@@ -51,7 +51,7 @@ class FieldLosses(StrictModel):
     """Lead of a command over the field: v = w + z, z + decay_s z' = h(e).
 
     e = field_s w' + output_s m', h(e) = e (1 / (1 - self_growth |e|) + growth |e| + bend e^2 +
-    excess / sqrt(|e| + e_0)); beyond self_growth |e| = 0.9 the first part continues along its
+    excess / sqrt(|e| + e_0)); beyond self_growth |e| = 0.9 the first term continues along its
     tangent.
 
     Attributes:
@@ -76,8 +76,9 @@ class FieldLosses(StrictModel):
     def sampled(self, sample_rate_hz: float, span: float, slope: float) -> Losses:
         """Return the losses in the form of the kernels.
 
-        A command is constant during a sample, so field and losses are means over it. ``span`` is
-        that of the effective fields, ``slope`` the operators' mean slope in um per command unit.
+        A command is constant during a sample, so field and losses are means over the sample.
+        ``span`` is the span of the effective fields, ``slope`` the operators' mean slope in um per
+        command unit.
         """
         lags = self.decay_s * sample_rate_hz
         lag_s = self.field_s + self.output_s * slope
@@ -100,8 +101,8 @@ class ThermalActivation(StrictModel):
     """Creep of plays: behind u by d, a play of threshold r moves at rate exp((d - r) / width).
 
     Attributes:
-        width: In the input unit; loops are wider by about 2.3 of it per decade of the rate.
-        rate: In input units per s, at which the thresholds hold.
+        width: In the input unit; loops widen by about 2.3 times the width per decade of the rate.
+        rate: Rate at which the thresholds are valid, in input units per s.
     """
 
     width: float = Field(gt=0.0, allow_inf_nan=False)
@@ -121,17 +122,17 @@ class OutputCurve(CheckedModel):
 
     def _problems(self) -> Iterator[str]:
         if len(self.operators_um) != len(self.displacement_um) or len(self.operators_um) < 2:
-            yield "the curve needs as many displacement_um as operators_um, and two at least"
+            yield "the curve must have as many displacement_um as operators_um, at least two"
         for name in ("operators_um", "displacement_um"):
             if any(np.diff(getattr(self, name)) <= 0.0):
                 yield f"{name} must rise for the inverse to exist: {list(getattr(self, name))}"
 
 
 class FieldModel(HysteresisModel):
-    """Plays and drags of an effective field u = w + coupling m, a curve after them, losses before.
+    """Plays and drags of an effective field u = w + coupling m, between losses and an output curve.
 
-    Unlike those of a sum of plays, minor loops depend on the output (curve, coupling) and, through
-    the drags, on their number of repeats. See :mod:`hilctl.kernels.field` for the equations.
+    Unlike the minor loops of a sum of plays, these depend on the output (curve, coupling) and,
+    through the drags, on the number of repeats. See :mod:`hilctl.kernels.field` for the equations.
 
     The output lags the commands of a run by one sample: use it in a
     :class:`~hilctl.models.staged.StagedModel`.
@@ -143,11 +144,11 @@ class FieldModel(HysteresisModel):
         cell: Width of a cell of the plays, > 0.
         slopes: For each line of plays, then for each drag, its slope in each cell, um per input
             unit, >= 0; > 0 in the first line, so that the inverse exists. All plays have the same
-            cells; all drags have the same, over the range of the plays.
+            cells; all drags have the same cells over the range of the plays.
         coupling: Effective field per um of the operators, in input units.
         curve: From the operators' output to displacement.
         losses: Lead of the command.
-        activation: Creep of the plays; None for none.
+        activation: Creep of the plays, or None.
     """
 
     STANDALONE = False
@@ -177,7 +178,7 @@ class FieldModel(HysteresisModel):
             )
 
     def _lines(self) -> tuple[tuple[Weights, ...], tuple[Weights, ...]]:
-        """Return the slopes of the plays, and those of the drags."""
+        """Return the slopes of the plays and the slopes of the drags."""
         plays = len(self.thresholds)
         return self.slopes[:plays], self.slopes[plays:]
 

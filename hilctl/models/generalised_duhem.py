@@ -19,9 +19,9 @@ _NUMBERS = 3  # of the memory, before the previous input
 class GeneralisedDuhemModel(HysteresisModel):
     """dy/dw = g_up(y, w - c(y)) rising, g_down(y, w - c(y)) falling; losses before it.
 
-    The slope depends on position and direction only. So minor loops drift towards the anhysteretic
-    curve of Jiles and Atherton, which a sum of plays cannot represent; but turns are not
-    remembered. See :mod:`hilctl.kernels.generalised_duhem`.
+    The slope depends only on position and direction. Therefore minor loops drift towards the
+    anhysteretic curve of Jiles and Atherton, which a sum of plays cannot represent, but the model
+    has no memory of turning points. See :mod:`hilctl.kernels.generalised_duhem`.
 
     The output lags the commands of a run by one sample: use it in a
     :class:`~hilctl.models.staged.StagedModel`.
@@ -31,10 +31,10 @@ class GeneralisedDuhemModel(HysteresisModel):
         cell_um: Distance of the nodes of y, > 0.
         centre: c at each node of y, rising, in the input unit; the ends continue linearly.
         flux: m at each node, rising, in um; source of eddy currents.
-        half_width: Of the band around the centre, in the input unit, > |c(0)|: at rest y and w are
-            0. Nodes across it are as far from each other.
+        half_width: Half width of the band around the centre, in the input unit, > |c(0)|, because y
+            and w are 0 at rest. Nodes across the band are evenly spaced.
         rising: For each node of y, g_up at each node across the band, um per input unit, > 0.
-        falling: The same, g_down.
+        falling: g_down in the same form.
         losses: Lead of the command.
     """
 
@@ -54,7 +54,7 @@ class GeneralisedDuhemModel(HysteresisModel):
         if problems := list(self._table_problems()):
             yield from problems
         elif not (least := abs(self._centre_at_rest())) <= self.half_width:
-            rule = f"half_width must be at least |c(0)|, {least:g}, for rest to lie in the band"
+            rule = f"half_width must be at least |c(0)|, {least:g}, so that rest is in the band"
             yield f"{rule}: {self.half_width!r}"
 
     def _table_problems(self) -> Iterator[str]:
@@ -64,7 +64,7 @@ class GeneralisedDuhemModel(HysteresisModel):
         for name in ("centre", "flux"):
             line = getattr(self, name)
             if len(line) != nodes or nodes < 2:
-                yield f"{name} needs as many values as centre, and two at least: {len(line)}"
+                yield f"{name} must have as many values as centre, at least two: {len(line)}"
             if any(np.diff(line) <= 0.0):
                 yield f"{name} must rise for the inverse to exist: {list(line)}"
         across = len(self.rising[0]) if self.rising else 0
@@ -72,7 +72,7 @@ class GeneralisedDuhemModel(HysteresisModel):
             table = getattr(self, name)
             if len(table) != nodes or any(len(row) != across for row in table) or across < 2:
                 yield (
-                    f"{name} needs a row for each value of centre, all of one length, two at least:"
+                    f"{name} must have a row per value of centre, all of one length >= 2:"
                     f" {[len(row) for row in table]} for {nodes}"
                 )
             elif least := [value for row in table for value in row if not value > 0.0]:
@@ -111,7 +111,7 @@ class GeneralisedDuhemModel(HysteresisModel):
 
 
 def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_width: float) -> Band:
-    """Return an operator for its kernels, from slopes float64[2, k, l] > 0 and lines float64[2, k].
+    """Return an operator for kernels, from slopes float64[2, k, l] > 0 and lines float64[2, k].
 
     The lines are centre and flux at k nodes of y, ``cell_um`` apart from ``lowest_um`` on.
     """
@@ -121,14 +121,14 @@ def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_widt
 
 
 def longest_steps(slopes: F64, centre: F64, cell_um: float, apart: float) -> F64:
-    """Return the longest steps of y for which w rises with y whatever the step's length.
+    """Return the longest steps of y for which w rises with y for any shorter step.
 
     A step s takes dw = s / g at its middle, which rises with s if
-    g > s / 2 (dg/dy + dg/dw (1 / g - c')). Each cell has the lowest slope of it and its
-    neighbours, and a step the limits of all cells that its middle may lie in, which are these.
+    g > s / 2 (dg/dy + dg/dw (1 / g - c')). Each cell is assigned the lowest slope of itself and its
+    neighbours, because the middle of a step may lie in any of these.
 
     Returns:
-        float64[2, k - 1, l - 1], by the cell that a step begins in.
+        float64[2, k - 1, l - 1], by the cell in which a step begins.
     """
     by_y = np.abs(np.diff(slopes, axis=1)) / cell_um
     by_w = np.abs(np.diff(slopes, axis=2)) / apart

@@ -63,7 +63,7 @@ class DeadbandFunction(CheckedModel):
         return out
 
     def inverse(self) -> "DeadbandFunction":
-        """Return Lambda^-1, of the same form: thresholds Lambda(d_j), reciprocal slopes.
+        """Return Lambda^-1 in the same form: thresholds Lambda(d_j), reciprocal slopes.
 
         Raise ModelError if slopes differ too much for the precision of the inverse.
         """

@@ -1,7 +1,7 @@
 """Kinds of model by name: the classes of model files, and the fits of ``hilctl identify --model``.
 
-A kind is registered as text, so a run imports the module of its own model only, and no fit. One fit
-may give a model of another name. A package adds a kind with::
+A kind is registered as text, so a run imports only the module of its own model, and no fit. A fit
+may return a model of another kind. A package adds a kind with::
 
     [project.entry-points."hilctl.models"]
     my_kind = "my_package.model:MyModel"
@@ -61,7 +61,7 @@ BUILTIN: Mapping[str, Mapping[str, str]] = {
 
 
 def known(group: str) -> dict[str, str]:
-    """Return the names of a group, each with its ``module:object``; hilctl's own first."""
+    """Return the names of a group, each with its ``module:object``; names of hilctl first."""
     others = {name: point.value for name, point in registered(group).items()}
     return {**BUILTIN[group], **others, **BUILTIN[group]}
 

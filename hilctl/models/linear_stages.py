@@ -24,10 +24,10 @@ _WIDEST = 64
 
 
 class Chain(Operator):
-    """Operators in series as one operator with one memory, of which theirs are parts.
+    """Operators in series as one operator; their memories are parts of one array.
 
     Args:
-        preview: Samples by which the chain's input must run ahead of its output.
+        preview: Samples by which the chain's input must lead its output.
     """
 
     def __init__(
@@ -48,7 +48,7 @@ class Chain(Operator):
         self.keep_in(self._memory)
 
     def keep_in(self, memory: F64) -> None:
-        """Move the memory, including that of each stage, into a given array."""
+        """Move the memory, including the memories of the stages, into an array."""
         super().keep_in(memory)
         start = 0
         for stage in self.stages:
@@ -72,7 +72,7 @@ def delayed(samples: int) -> Operator:
 
 
 def between(part: float) -> Operator:
-    """Return an operator that interpolates: ``part`` of the way from the previous sample."""
+    """Return an operator that interpolates at the fraction ``part`` from the previous sample."""
     return Operator(between_block, (part,), 0)
 
 
@@ -83,8 +83,8 @@ def smoothing_weights(
 
     A cubic B-spline (four boxes in series) smooths, and minus half its variance times y'' flattens
     its response to 1 - (w s)^4 / 8 at an angular frequency w. The standard deviation s is ``width``
-    in samples; 0 for plain central differences. So slow signals pass unchanged, and corners are
-    rounded within about 2 s. Boxes are at most 64 samples long.
+    in samples; 0 for plain central differences. Slow signals therefore pass unchanged, and corners
+    are rounded within about 2 s. Boxes are at most 64 samples long.
 
     Returns:
         float64[2m + 1], weights from the oldest to the newest sample, with the sum 1; and m, the
@@ -158,7 +158,7 @@ class _CreepOperator(Operator):
         elements[:] = left * elements + gained * (x if np.isfinite(x) else 0.0)
 
 
-_SLOWEST = 1e12  # samples per radian of the structure; slower ones do not move
+_SLOWEST = 1e12  # samples per radian of the structure; slower structures do not move
 
 
 class FirstMode(StrictModel):
@@ -211,10 +211,10 @@ class FurtherMode(StrictModel):
     """A further mode of the structure, with its antiresonance.
 
     Modes side by side share the static displacement: y = ((1 - c) G_1 + c G_2) x, where
-    G = 1 / (1 + 2 zeta s / w + s^2 / w^2). That is the first of them followed by
+    G = 1 / (1 + 2 zeta s / w + s^2 / w^2). This is the first mode followed by
     (1 + 2 Z s / W + s^2 / W^2) G_2: the further mode's own resonance, and the antiresonance (W, Z)
-    where the two cancel; see A. Preumont, "Vibration Control of Active Structures" (Springer,
-    2011). The inverse exchanges the two, and is stable because both are damped.
+    at which both modes cancel; see A. Preumont, "Vibration Control of Active Structures" (Springer,
+    2011). The inverse exchanges resonance and antiresonance, and is stable because both are damped.
 
     Attributes:
         natural_hz: w / (2 pi), in Hz.
@@ -268,8 +268,8 @@ MODE_NUMBERS = 4
 def modes_of(logarithms: F64) -> tuple[FurtherMode, ...]:
     """Return modes from the parameters of a fit: float64[4 m].
 
-    They are the logarithms of each mode's natural frequency, damping ratio, ratio of the
-    antiresonance to it, and damping ratio of the antiresonance.
+    For each mode these are the logarithms of natural frequency, damping ratio, antiresonance
+    relative to the natural frequency, and damping ratio of the antiresonance.
     """
     return tuple(
         FurtherMode(

@@ -18,12 +18,12 @@ class ModelFile(StrictModel):
     @classmethod
     def _stands_alone(cls, model: HysteresisModel) -> HysteresisModel:
         if not model.STANDALONE:
-            raise ValueError(f"kind must be one for runs, such as staged around it: {model.kind!r}")
+            raise ValueError(f"kind must be usable in runs; use a staged model: {model.kind!r}")
         return model
 
 
 def load_model(path: Path, files: TextFiles | None = None) -> HysteresisModel:
-    """Read a model file; raise InputError if it is not readable, ConfigError with broken rules."""
+    """Read a model file; raise InputError if unreadable, ConfigError with all violated rules."""
     return load_document(path, files).validate(ModelFile).model
 
 
@@ -38,5 +38,5 @@ def dump_model(model: HysteresisModel) -> str:
 
 
 def model_sha256(model: HysteresisModel | None) -> str:
-    """Return the digest of a model as its file would be; empty without a model."""
+    """Return the digest of a model's file content; empty without a model."""
     return hashlib.sha256(dump_model(model).encode()).hexdigest() if model else ""

@@ -21,12 +21,12 @@ from hilctl.models.base import (
 
 
 def inverse_plays(direct: float, weights: F64, thresholds: F64) -> tuple[float, F64, F64]:
-    """Return the inverse of a sum of plays (a_0 > 0, a_i >= 0, r_i rising), itself one (5.8-5.10).
+    """Return the inverse of a sum of plays (a_0 > 0, a_i >= 0, r_i rising), also a sum (5.8-5.10).
 
     Returns:
         The inverse's direct weight 1/a_0, its weights float64[n] (<= 0) and its thresholds
-        float64[n] at zero rate. With the rate, each grows by ``a_0`` times the common growth of
-        the r_i.
+        float64[n] at zero rate. With the rate, each threshold grows by ``a_0`` times the common
+        growth of the r_i.
 
     Raises:
         ModelError: The numbers of the inverse are not finite.
@@ -69,7 +69,7 @@ class PlayModel(HysteresisModel):
         return 0.0
 
     def inverse_rate_gain(self, sample_rate_hz: float) -> float:
-        """Return the growth of the inverse's thresholds for a change of 1 between samples.
+        """Return the growth of the inverse's thresholds per unit change between samples.
 
         The rate of ``x / sum a_i``, the command at which the loop of an input x closes,
         approximates the rate of the unknown command.

@@ -1,4 +1,4 @@
-"""A model with its identified residual, and the inverse of both: read from files of 0.2.0."""
+"""A model with its identified residual, and the inverse of both; only for files of 0.2.0."""
 
 from collections.abc import Callable, Iterator
 from typing import Literal, Self
@@ -25,13 +25,13 @@ class ResidualOperator(CheckedModel):
     Attributes:
         lowest_um: Lower end of the first cell of x.
         cell_um: Width of a cell, > 0.
-        thresholds_um: Of the plays, rising from 0; the first is 0.
+        thresholds_um: Thresholds of the plays, rising from 0; the first is 0.
         slopes: For each play, its slope in each cell.
-        lengths_um: Of the drags, each > 0.
+        lengths_um: Lengths of the drags, each > 0.
         drags_um: For each drag, a at the edges of the cells; then for each drag b.
         rate_um: c at the edges of the cells.
         window_s: Time over which the rate of x is measured, in s.
-        fastest_um_per_s: Rate that counts as 1, like all faster ones.
+        fastest_um_per_s: Rate that counts as 1, as do all higher rates.
     """
 
     lowest_um: float
@@ -51,7 +51,7 @@ class ResidualOperator(CheckedModel):
         yield from threshold_problems("l", self.lengths_um)
         cells = len(self.rate_um) - 1
         if cells < 1:
-            yield f"rate_um must have two values at least: {len(self.rate_um)}"
+            yield f"rate_um must have at least two values: {len(self.rate_um)}"
         for name, lines, count, size in (
             ("slopes", self.slopes, len(self.thresholds_um), cells),
             ("drags_um", self.drags_um, 2 * len(self.lengths_um), cells + 1),
@@ -106,7 +106,7 @@ class RefinedModel(HysteresisModel):
     """A model followed by a residual operator and a constant displacement.
 
     Attributes:
-        base: The model; the unit and the ranges are the refined model's.
+        base: The model; it has the unit and the ranges of the refined model.
         residual: R of its displacement relative to rest.
     """
 
@@ -116,9 +116,9 @@ class RefinedModel(HysteresisModel):
 
     def _problems(self) -> Iterator[str]:
         if not self.base.STANDALONE or isinstance(self.base, RefinedModel):
-            yield f"base.kind must be one for runs, and not refined: {self.base.kind!r}"
+            yield f"base.kind must be usable in runs, and not refined: {self.base.kind!r}"
         if self.base.input_unit != self.input_unit:
-            yield f"base.input_unit must be {self.input_unit}, as outside"
+            yield f"base.input_unit must equal input_unit, {self.input_unit}"
 
     @property
     def operators(self) -> int:
@@ -140,7 +140,7 @@ class RefinedModel(HysteresisModel):
     def inverse(self, sample_rate_hz: float) -> Chain:
         """Return the operator from displacement in um, ``preview`` samples ahead, to command.
 
-        Raise ModelError as the inverse of the base does.
+        Raise ModelError if the inverse of the base does.
         """
         operator = self.residual.inverse(sample_rate_hz, rest_um(self.base))
         inverse = self.base.inverse(sample_rate_hz)
@@ -149,6 +149,6 @@ class RefinedModel(HysteresisModel):
         )
 
     def earlier(self) -> Self | None:
-        """Return the model with the inverse of its base as of 0.2.0."""
+        """Return the model with the inverse that its base had in 0.2.0."""
         base = self.base.earlier()
         return None if base is None else self.model_copy(update={"base": base})

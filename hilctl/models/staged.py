@@ -2,15 +2,15 @@
 
 Command -> field lag -> hysteresis -> structure -> modes -> delay -> creep -> displacement. A
 displacement is sampled when its command is output and cannot show its effect, see
-:mod:`hilctl.base.device`; so the forward operator lags its input by one sample, and ``delay_s`` is
-additional.
+:mod:`hilctl.base.device`; so the forward operator lags its input by one sample in addition to
+``delay_s``.
 
-The inverse has the reverse order. Its input must run ahead of its output by
+The inverse has the reverse order. Its input must lead its output by
 :attr:`~hilctl.models.base.Operator.preview` samples: one for the loop, then the delay, then the
 preview of the smoothing. ``inverse.process(reference[k + preview])`` is the command of sample k. It
-is finite for every finite reference: the inverse of the lag is limited to the speed of the lag,
-that of the structure acts on a displacement smoothed over a radian of its natural frequency, and
-that of further modes is exact.
+is finite for every finite reference: the inverse of the lag is limited to the speed of the lag, the
+inverse of the structure acts on a displacement smoothed over a radian of its natural frequency, and
+the inverse of further modes is exact.
 """
 
 import math
@@ -37,7 +37,7 @@ _WHOLE = 1e-6
 
 
 def split_frame(model: Model) -> tuple[Model, dict[str, Any]]:
-    """Return a model as a part of another one, and the unit, ranges and provenance of both."""
+    """Split a model into a part of another model, and the unit, ranges and provenance of both."""
     names = ("input_unit", "input_range", "output_range_um", "provenance")
     bare = {"input_range": None, "output_range_um": None, "provenance": Provenance()}
     return model.model_copy(update=bare), {name: getattr(model, name) for name in names}
@@ -72,8 +72,8 @@ class StagedModel(HysteresisModel):
     """A hysteresis model with linear stages around it.
 
     Attributes:
-        hysteresis: Model of the hysteresis; the unit and the ranges are the staged model's.
-        lag: Lag of the field behind the command, or None.
+        hysteresis: Model of the hysteresis, with the unit and the ranges of the staged model.
+        lag: Lag of the field relative to the command, or None.
         structure: First mode of the structure; None for a rigid one.
         modes: Further modes, each with its antiresonance.
         delay_s: Transport delay in addition to one sample, in s.
@@ -101,12 +101,12 @@ class StagedModel(HysteresisModel):
 
     def _problems(self) -> Iterator[str]:
         if not self.hysteresis.STAGEABLE:
-            yield f"hysteresis.kind must be one that takes stages: {self.hysteresis.kind!r}"
+            yield f"hysteresis.kind must be usable in a staged model: {self.hysteresis.kind!r}"
         for name in ("input_range", "output_range_um"):
             if getattr(self.hysteresis, name) is not None:
-                yield f"hysteresis.{name} must be set beside hysteresis instead"
+                yield f"hysteresis.{name} must be set next to hysteresis, not in it"
         if self.hysteresis.input_unit != self.input_unit:
-            yield f"hysteresis.input_unit must be {self.input_unit}, as outside"
+            yield f"hysteresis.input_unit must equal input_unit, {self.input_unit}"
 
     @property
     def operators(self) -> int:
@@ -114,7 +114,7 @@ class StagedModel(HysteresisModel):
         return self.hysteresis.operators
 
     def forward(self, sample_rate_hz: float) -> Chain:
-        """Return the operator from command to displacement in um, at rest in its first input."""
+        """Return the operator from command to displacement in um, at rest at its first input."""
         whole, part = self._delay(sample_rate_hz)
         stages = [delayed(1) if self.lag is None else self.lag.forward(sample_rate_hz)]
         stages.append(self.hysteresis.forward(sample_rate_hz))
@@ -132,7 +132,7 @@ class StagedModel(HysteresisModel):
     def inverse(self, sample_rate_hz: float) -> Chain:
         """Return the operator from displacement in um, ``preview`` samples ahead, to command.
 
-        Raise ModelError as the inverses of the hysteresis and of the modes do.
+        Raise ModelError if the inverse of the hysteresis or of a mode does.
         """
         whole, part = self._delay(sample_rate_hz)
         preview = 1 + whole + (1 if part else 0)
@@ -162,8 +162,8 @@ class StagedModel(HysteresisModel):
         """Return the inverse of the structure from derivatives of a smoothed displacement.
 
         The exact inverse of the sampled structure is nearly unstable: it has a pole near -1. The
-        complete smoothing, which includes its own second derivative, precedes the derivatives: so
-        the zeros of the inverse cancel the poles of the structure, and corners do not excite it.
+        complete smoothing, including its second-derivative term, precedes the derivatives. The
+        zeros of the inverse then cancel the poles of the structure, and corners do not excite it.
         """
         structure, width = self.structure, self.smoothing_s * sample_rate_hz
         if structure is None:

@@ -1,12 +1,12 @@
-"""Translate kernels, with all kernels that they call, from Python to C or MATLAB.
+"""Translator of kernels and their callees from Python to C or MATLAB.
 
 A kernel is restricted Python: numbers, arrays of numbers and tuples of them, with annotated
 arguments. Each of its statements has one counterpart in C and in MATLAB, so the results agree to
 the last bits of ``exp`` and similar functions. Other syntax raises an error.
 
 In C a tuple is a structure. In MATLAB it is a cell array, and a function returns each array that
-it changes. An expression of MATLAB can neither change an array nor choose between two values: such
-parts become statements before it.
+it changes. A MATLAB expression can neither change an array nor choose between two values: such
+operations become statements before it.
 """
 
 import ast
@@ -50,8 +50,8 @@ class KernelSource:
         name: Name of the translated function.
         arguments: Types of its arguments, by name.
         returns: Type of its result.
-        changed: Names of the arrays that it changes.
-        callees: Kernels that it calls, by their name in Python.
+        changed: Names of the arrays that the kernel changes.
+        callees: Kernels that the kernel calls, by their name in Python.
     """
 
     name: str
@@ -90,7 +90,7 @@ def source_of(kernel: Callable[..., Any]) -> KernelSource:
 
 
 def _stored(statements: Iterable[ast.stmt]) -> set[str]:
-    """Return the names of the variables and arrays that some statements store to."""
+    """Return the names of the variables and arrays that statements store to."""
     nodes = (each for statement in statements for each in ast.walk(statement))
     stored = (each for each in nodes if isinstance(each, ast.Subscript | ast.Name))
     return {_root(each) for each in stored if isinstance(each.ctx, ast.Store)} - {"_"}
@@ -128,7 +128,7 @@ class Translator:
 
     comment: ClassVar = ("/* ", " */")
     block: ClassVar = (" {", "} else {", "}")
-    """End of the first line of a block, line between both branches, last line."""
+    """End of the first line of a block, line between the two branches, last line."""
     negation: ClassVar = "!"
     first: ClassVar = 0
     """Index of the first item."""
@@ -136,7 +136,7 @@ class Translator:
         "min_": "static double min_(double a, double b) { return b < a ? b : a; }",
         "max_": "static double max_(double a, double b) { return b > a ? b : a; }",
     }
-    """Functions that differ from those of the language for NaN or -0."""
+    """Functions that differ from built-in ones for NaN or -0."""
     forms: ClassVar = {
         "int": "(int)({})", "abs": "fabs({})", "FloorDiv": "{} / {}", "Mod": "{} % {}",
         "size": "{}.n0", "shape": "{}.n{}", "item": "{}.f{}", "tuple": "({0}){{{1}}}",
@@ -154,14 +154,14 @@ class Translator:
         self._depth = 1
 
     def add(self, kernel: Callable[..., Any]) -> KernelSource:
-        """Translate a kernel and its callees, and return its source, or raise ModelError."""
+        """Translate a kernel and its callees; return its source, or raise ModelError."""
         source = source_of(kernel)
         if source.name in self.functions:
             return source
         for callee in source.callees.values():
             self.add(callee.function)
         self._kernel, self._types = source, dict(source.arguments)
-        for _ in range(2):  # the first time finds the types of all variables
+        for _ in range(2):  # the first pass determines the types of all variables
             self._lines, self._temporaries = [], 0
             self._statements(source.node.body)
         summary = re.sub(":func:|`", "", inspect.getdoc(source.function) or "").partition("\n")[0]
@@ -193,7 +193,7 @@ class Translator:
         self._depth -= deeper
 
     def _check_order(self, node: ast.stmt) -> None:
-        """Refuse a statement that uses an array beside a call that changes it."""
+        """Reject a statement that both uses an array and calls a kernel that changes it."""
         for call in (each for each in ast.walk(node) if isinstance(each, ast.Call)):
             for array in _changed_by(call, self._kernel.callees):
                 if _names(node).count(array.id) > _names(call).count(array.id):
@@ -231,7 +231,7 @@ class Translator:
                 orelse=[],
             ):
                 low, high = ("0", *(self._value(arg)[0] for arg in args))[-2:]
-                if _stored(node.body) & {name, *_names(node.iter)}:  # C looks again in every pass
+                if _stored(node.body) & {name, *_names(node.iter)}:  # C evaluates it in every pass
                     raise self._error(node.iter)
                 self._types[name] = int
                 if not re.fullmatch(r"[\w.()]+", high):
@@ -343,7 +343,7 @@ class Translator:
         return (f"({text})" if compound else text), kind
 
     def _joined(self, node: ast.AST, *types: Type) -> Type:
-        """Return the type of a value that is one of several."""
+        """Return the common type of several possible values."""
         if len(set(types)) == 1:
             return types[0]
         if not set(types) <= {float, int}:
@@ -418,7 +418,7 @@ class Translator:
     def _number(self, value: Any) -> Value:
         return self.literal(value), float if isinstance(value, float) else int
 
-    # What differs between the languages
+    # Differences between the languages
 
     def literal(self, value: float) -> str:
         """Return a number."""
@@ -480,7 +480,7 @@ class Translator:
 
 
 class MatlabTranslator(Translator):
-    """Translates kernels to MATLAB, in the subset that Octave has too."""
+    """Translates kernels to MATLAB, in the subset that Octave supports."""
 
     comment: ClassVar = ("% ", "")
     block: ClassVar = ("", "else", "end")

@@ -1,4 +1,4 @@
-"""Export the inverse of a model, or the model, as one function in a C or MATLAB file."""
+"""Export of a model or its inverse as one function in a C or MATLAB file."""
 
 import re
 import textwrap
@@ -22,10 +22,10 @@ _WIDTH = 96
 def export_text(
     model: HysteresisModel, output: Path, sample_rate_hz: float, *, forward: bool = False
 ) -> str:
-    """Return the text of a ``.c`` or ``.m`` file with a function of its name and state.
+    """Return the text of a ``.c`` or ``.m`` file with a function of that name and its state.
 
-    It is the inverse, or the model if ``forward``. Raise InputError if the name of the file or the
-    sample rate is invalid, ModelError if the model has no inverse at this rate.
+    The function computes the inverse, or the model if ``forward``. Raise InputError if the name of
+    the file or the sample rate is invalid, ModelError if the model has no inverse at this rate.
     """
     form = {".c": _CFile, ".m": _MatlabFile}.get(output.suffix)
     problems = []
@@ -33,8 +33,8 @@ def export_text(
         problems.append("must end in .c or .m")
     if not re.fullmatch(rf"[A-Za-z]\w{{0,{_LONGEST_NAME - 1}}}", output.stem, re.ASCII):
         problems.append(
-            f"must have a name of letters, digits and underscores, {_LONGEST_NAME} at most, the "
-            "first a letter, because the function has that name"
+            f"must have a name of letters, digits and underscores, at most {_LONGEST_NAME}, the "
+            "first one a letter, because the function gets that name"
         )
     if problems or form is None:
         raise InputError(f"{output}: {'; '.join(problems)}")
@@ -46,7 +46,7 @@ def export_text(
     file = form(output.stem, source, target)
     text = file.text(operator, list(facts))
     if RESERVED.fullmatch(output.stem) or output.stem in file.translator.functions:
-        raise InputError(f"{output}: the code uses the name {output.stem}: give another name")
+        raise InputError(f"{output}: the code uses the name {output.stem}: choose another name")
     return text
 
 
@@ -59,7 +59,7 @@ def check_rate(sample_rate_hz: float) -> None:
 def _facts(
     model: HysteresisModel, operator: Operator, sample_rate_hz: float, *, forward: bool
 ) -> Iterator[str]:
-    """Yield the lines of the comment that both languages have in common."""
+    """Yield the comment lines common to both languages."""
     unit, known = model.input_unit, model.provenance.identified_range
     units = f"command in {unit} to displacement in um"
     if not forward:
@@ -80,7 +80,7 @@ def _facts(
         yield f"identified:   {', '.join(texts)}, up to {known.speed_um_per_s:g} um/s"
     if operator.preview:
         lead = f"{operator.preview} samples"
-        yield f"preview:      {lead}; the command is that of the reference {lead} before"
+        yield f"preview:      {lead}; the command belongs to the reference {lead} before"
     yield f"written by:   hilctl {__version__}"
     yield ""
     if not forward:
@@ -88,7 +88,7 @@ def _facts(
 
 
 def _steps(operator: Operator) -> Iterator[Operator | float]:
-    """Yield the offsets and the operators of an operator, in the order of their use."""
+    """Yield the offsets and elementary operators of an operator in order of execution."""
     if operator.input_offset:
         yield operator.input_offset
     if isinstance(operator, Chain):
@@ -109,7 +109,7 @@ def _prefixed(prefix: str, texts: Iterable[str]) -> str:
 
 
 class _CFile:
-    """A C file with the function ``name``, and ``name_reset`` for its memory."""
+    """A C file with the function ``name``, and ``name_reset`` to initialise its memory."""
 
     def __init__(self, name: str, source: str, target: str) -> None:
         self.name, self.source, self.target = name, source, target

@@ -12,14 +12,14 @@ from hilctl.models.literature.implicit_models import NOTHING, ImplicitModel, Pac
 class BoucWenModel(ImplicitModel):
     """direct v - hysteretic z[v], with z' = v' - beta |v'| |z|^(n-1) z - gamma v' |z|^n.
 
-    This is (1.21) with alpha included in ``hysteretic`` and signs that keep z bounded. The step
-    between samples is exact, so the rate has no influence. Loops are symmetric.
+    This is (1.21) with alpha included in ``hysteretic`` and signs that keep z bounded. The
+    integration between samples is exact, so the sample rate has no influence. Loops are symmetric.
 
     Attributes:
         direct: um per input unit.
         hysteretic: um per input unit, >= 0.
         beta: Per input unit to the n.
-        gamma: The same, at most beta and above -beta.
+        gamma: Per input unit to the n, at most beta and above -beta.
         exponent: n; 1 and 2 have exact solutions.
     """
 

@@ -24,10 +24,10 @@ class PlayEnvelope(StrictModel):
     """``height tanh(slope v + shift) + level``.
 
     Attributes:
-        height: Half the difference of both saturated ends, > 0.
+        height: Half the difference of both saturation values, > 0.
         slope: Per command unit, > 0.
         shift: -slope times the steepest point.
-        level: Mean of both saturated ends.
+        level: Mean of both saturation values.
     """
 
     height: float = 1.0
@@ -44,7 +44,7 @@ class GeneralisedModel(BoundedInputModel):
     """p_0 S_0[v] + sum p_i S_i[v], asymmetric and saturating, rate-independent (1.20).
 
     If the falling envelope is above the rising one, the model has a dead zone after a turn, and its
-    inverse jumps. Where it would be below, it follows the rising one.
+    inverse jumps. A falling envelope never goes below the rising one; it follows it instead.
 
     Attributes:
         direct: p_0, um, > 0.
@@ -72,7 +72,7 @@ class GeneralisedModel(BoundedInputModel):
 
     @property
     def operators(self) -> int:
-        """Number of operators with memory: the plays, and the one of threshold 0."""
+        """Number of operators with memory: the plays, and the play of threshold 0."""
         return len(self.weights) + 1
 
     def _envelopes(self) -> Envelopes:

@@ -1,4 +1,4 @@
-"""Base of models whose inverse is a root at each sample, and of those with a bounded one."""
+"""Base classes of models whose inverse is a root at each sample, or has a bounded output."""
 
 from abc import abstractmethod
 from typing import Self, TypeAlias
@@ -39,9 +39,9 @@ class BoundedInputModel(HysteresisModel):
 class ImplicitModel(BoundedInputModel):
     """A rate-independent model that rises with the command, without an analytic inverse.
 
-    For a given memory the displacement is a continuous, non-decreasing map of the next command;
-    the inverse finds the root of that map at each sample by bracketed secants from the last
-    command. The number of steps and the command are bounded.
+    For a given memory the displacement is a continuous, non-decreasing function of the next
+    command. At each sample the inverse finds the root of this function by bracketed secants from
+    the last command. The number of steps and the command are bounded.
     """
 
     @abstractmethod

@@ -13,12 +13,12 @@ from hilctl.models.literature.implicit_models import ImplicitModel, PackedParame
 class KrasnoselskiiPokrovskiiModel(ImplicitModel):
     """sum rho_ij M_ij[v] (1.3-1.5), M_ij rising above alpha_i and falling below beta_j on a ridge.
 
-    Thresholds are the levels of an even grid, alpha_i >= beta_j, and a ridge is as wide as the grid
-    is spaced: the ridges of the diagonal cover all of it without a gap.
+    Thresholds are the levels of an even grid, alpha_i >= beta_j, and the width of a ridge is the
+    spacing of the grid, so the ridges on the diagonal cover it without gaps.
 
     Attributes:
         lowest: Lowest level, in the input unit.
-        spacing: Distance of the levels, and width a of a ridge (1.3), > 0.
+        spacing: Spacing of the levels, and width a of a ridge (1.3), > 0.
         weights: For each level i from the lowest, rho_i0 to rho_ii, um, >= 0, the last of each > 0,
             so that the inverse exists.
     """

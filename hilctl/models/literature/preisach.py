@@ -1,4 +1,4 @@
-"""The Preisach model, and tables of slopes as its lines have."""
+"""The Preisach model, and the slope tables of its lines."""
 
 from collections.abc import Iterator, Sequence
 from typing import Literal
@@ -67,7 +67,7 @@ def play_tables(slopes: F64, lowest: float, cell: float) -> F64:
 
 
 def line_problems(thresholds: Thresholds) -> Iterator[str]:
-    """Yield broken conditions for the thresholds of lines of slopes."""
+    """Yield violated conditions for the thresholds of lines of slopes."""
     if not thresholds or thresholds[0] != 0.0:
         yield f"the first threshold must be 0: {list(thresholds[:1])}"
     if any(np.diff(thresholds) <= 0.0):
@@ -75,7 +75,7 @@ def line_problems(thresholds: Thresholds) -> Iterator[str]:
 
 
 def cell_problems(cell: float, slopes: Sequence[Weights]) -> Iterator[str]:
-    """Yield broken conditions for the inverse of lines of slopes."""
+    """Yield violated conditions for the inverse of lines of slopes."""
     if not cell > 0.0:
         yield f"cell must be > 0: {cell!r}"
     yield from table_problems(slopes)
@@ -84,7 +84,7 @@ def cell_problems(cell: float, slopes: Sequence[Weights]) -> Iterator[str]:
 
 
 def table_problems(slopes: Sequence[Weights]) -> Iterator[str]:
-    """Yield broken conditions for a table of slopes."""
+    """Yield violated conditions for a table of slopes."""
     for i, line in enumerate(slopes):
         if len(line) != len(slopes[0]) or not line:
             yield f"every line of slopes must have the same cells: {len(line)} in line {i}"

@@ -119,5 +119,5 @@ def test_conditions(changes, words):
 def test_a_curve_must_rise():
     with pytest.raises(ValidationError, match="displacement_um must rise"):
         OutputCurve(operators_um=(0.0, 1.0), displacement_um=(0.0, 0.0))
-    with pytest.raises(ValidationError, match="two at least"):
+    with pytest.raises(ValidationError, match="at least two"):
         OutputCurve(operators_um=(0.0,), displacement_um=(0.0,))

@@ -216,7 +216,7 @@ def test_the_inverse_undoes_the_model_on_its_wing(bias, input_range, wing):
 
 @pytest.mark.parametrize("output_range_um", [None, (-0.1, 20.0)])
 def test_both_wings_at_once_are_refused(output_range_um):
-    with pytest.raises(ModelError, match="one of its wings only"):
+    with pytest.raises(ModelError, match="output_range_um must begin"):
         butterfly(output_range_um=output_range_um).inverse(RATE_HZ)
 
 
