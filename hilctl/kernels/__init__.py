@@ -1,4 +1,4 @@
-"""Compiled arithmetic per sample: pure functions of plain arrays.
+"""Compiled per-sample arithmetic: pure functions of plain arrays.
 
 Rules: exact types in annotations, no globals, no objects; state is an argument, updated in place. A
 kernel and all kernels that it calls are in one file, because numba's on-disk cache does not detect

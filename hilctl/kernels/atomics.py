@@ -1,12 +1,12 @@
-"""Flags in shared memory that announce other data: published by a writer, observed by a reader.
+"""Ordered access to counters in shared memory that announce other data.
 
 A reader must see data before the number that announces them. x86-64 keeps the order of writes and
-reads by itself, ARM64 does not, and Python cannot request it. So these kernels use LLVM
-instructions: a store with release order and a load with acquire order. They also order later writes
-after a store, and earlier reads before a load: a reader that copies data and then checks that they
-are still valid has copied them by then.
+reads, ARM64 does not, and Python cannot request it. Therefore these kernels use LLVM instructions:
+a store with release order and a load with acquire order. They also order later writes after a
+store, and earlier reads before a load, so a reader can copy data and check afterwards that they
+were valid.
 
-A number that announces nothing needs none of this: aligned eight bytes are written and read whole.
+A number that announces nothing needs no such order: access to eight aligned bytes is atomic.
 """
 
 from collections.abc import Callable
@@ -57,7 +57,7 @@ def _plain_load(numbers: I64, index: int) -> int:
 
 _ReadOnly: TypeAlias = Annotated[I64, "Array(int64, 1, 'C', readonly=True)"]
 
-# Without the compiler, as for a debugger, the order is that of the processor.
+# Without the compiler, such as in a debugger, the processor determines the order.
 _store: Callable[[I64, int, int], None] = _plain_store
 _load: Callable[[I64, int], int] = _plain_load
 if not DISABLED:

@@ -1,17 +1,17 @@
 """Field lag, structure, transport delay and creep between samples, and their inverses.
 
-The memory of every kernel ends with the previous input; NaN means that there is none yet, and then
-the signal counts as constant before its first value. It is updated in place, so any cut into blocks
-gives the same bits. All signals are float64[n]; ``out`` may be the input array itself.
+The memory of every kernel ends with the previous input; NaN means that there is none yet. The
+signal then counts as constant before its first value. It is updated in place, so any division into
+blocks gives the same bits. All signals are float64[n]; ``out`` may be the input array itself.
 
-Creep: every element follows its share of the displacement x by first order, T c' = s x - c, and
-y = x + c_1 + c_2 + ... Each step uses the previous x, so that the inverse is exact. Creep begins
-with the first sample, from 0.
+Creep: every element follows its share of the displacement x with a first-order lag, T c' = s x - c,
+and y = x + c_1 + c_2 + ... Each step uses the previous x, so that the inverse is exact. Creep
+begins with the first sample, from 0.
 
 A mode is a pair of antiresonance and resonance. A mass on a damped spring follows x, which changes
 linearly between samples; the output is (1 + 2 Z s / W + s^2 / W^2) of its position, with the
-acceleration from its spring. So the output has a share of x itself, and the inverse is exact. The
-structure is a mode without an antiresonance: its output is the position.
+acceleration from its spring. The output therefore includes a share of x itself, and the inverse is
+exact. The structure is a mode without an antiresonance: its output is the position.
 """
 
 import math
@@ -21,11 +21,11 @@ import numpy as np
 from hilctl.base.types import F64
 from hilctl.kernels.jit import kernel
 
-# Share of the fastest change the lag allows that its inverse asks for; towards 1 the command that
-# takes grows beyond all bounds.
+# Largest change that the inverse requests, relative to the fastest one of the lag; the command
+# for it diverges towards 1.
 _REACH = 0.8
 _NEWTON_STEPS = 60
-_SMALL = 1e-17  # a growth that rounding hides
+_SMALL = 1e-17  # a growth below the rounding error
 
 
 @kernel()
@@ -52,11 +52,11 @@ def _left_behind(behind: float, growth: float, periods: float) -> float:
 
 @kernel()
 def lag_block(v: F64, periods: float, growth: float, memory: F64, out: F64) -> None:
-    """Let a first-order lag follow a command that is held from sample to sample.
+    """Compute a first-order lag of a command that is held between samples.
 
     tau (1 + b |v - x|) dx/dt = v - x, integrated exactly. ``out[k]`` is x when ``v[k]`` is output,
-    so it shows the commands up to ``v[k - 1]``. ``periods`` is T / tau > 0, ``growth`` is b >= 0,
-    per unit of ``v``. ``memory`` is float64[2]: x, the previous command.
+    so it includes the commands up to ``v[k - 1]``. ``periods`` is T / tau > 0, ``growth`` is b >=
+    0, per unit of ``v``. ``memory`` is float64[2]: x, the previous command.
     """
     for k in range(v.size):
         now, held, x = v[k], memory[1], memory[0]
@@ -75,9 +75,9 @@ def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> 
     """Find the commands that bring the lag of :func:`lag_block` to requested values, float64[n].
 
     ``out[k]`` brings it to ``x[k]`` when ``out[k + 1]`` is output. To move by D within a sample the
-    command must lead by D / (1 - exp(b D - T / tau)), which requires b D < T / tau: no lag of
-    this kind moves faster than 1 / (tau b). D stays below 0.8 of that, and the following samples
-    make up for the rest. ``memory`` is float64[2]: the lag's output, the previous command.
+    command must lead by D / (1 - exp(b D - T / tau)), which requires b D < T / tau: this lag cannot
+    move faster than 1 / (tau b). D is limited to 0.8 of that, and the following samples make up for
+    the rest. ``memory`` is float64[2]: the lag's output, the previous command.
     """
     furthest = _REACH * periods / growth if growth > 0.0 else math.inf
     for k in range(x.size):
@@ -88,7 +88,7 @@ def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> 
         size = min(abs(way), furthest)
         way = math.copysign(size, way)
         command = there - way / math.expm1(growth * size - periods)
-        if not abs(wanted) < math.inf:  # must not come out as a number
+        if not abs(wanted) < math.inf:  # must not become a number
             command = way = math.nan
         memory[0] = there + way
         memory[1] = command
@@ -97,7 +97,7 @@ def lead_block(x: F64, periods: float, growth: float, memory: F64, out: F64) -> 
 
 @kernel(inline=True)
 def _oldest(memory: F64, now: float) -> float:
-    """Append ``now`` to a queue of values, and return the oldest one, which leaves it."""
+    """Append ``now`` to a queue of values; remove and return the oldest one."""
     last = memory.size - 1
     if math.isnan(memory[last]):
         for i in range(last):
@@ -112,7 +112,7 @@ def _oldest(memory: F64, now: float) -> float:
 
 @kernel()
 def weigh_block(x: F64, weights: F64, memory: F64, out: F64) -> None:
-    """Sum a signal's last n >= 2 values; ``weights`` (float64[n]) begins with that of the oldest.
+    """Sum a signal's last n >= 2 values; ``weights`` is float64[n], oldest first.
 
     ``memory`` is float64[n]: the last n - 1 values, the previous one.
     """
@@ -132,7 +132,7 @@ def delay_block(x: F64, memory: F64, out: F64) -> None:
 
 @kernel()
 def between_block(x: F64, part: float, memory: F64, out: F64) -> None:
-    """Interpolate a signal: ``part`` (0 to 1) of the way from the previous sample to each.
+    """Interpolate a signal at the fraction ``part`` (0 to 1) from the previous sample to each.
 
     ``memory`` is float64[1]: the previous value.
     """
@@ -152,7 +152,7 @@ def _crept(parameters: F64, memory: F64) -> float:
     """Advance all elements by a sample, and return their sum."""
     elements = memory.size - 1
     before = memory[elements]
-    x = before if abs(before) < math.inf else 0.0  # none yet, or one that was no displacement
+    x = before if abs(before) < math.inf else 0.0  # no input yet, or an invalid one
     total = 0.0
     for i in range(elements):
         memory[i] = parameters[i] * memory[i] + parameters[elements + i] * x
@@ -164,9 +164,9 @@ def _crept(parameters: F64, memory: F64) -> float:
 def creep_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Add creep to a displacement from rest.
 
-    ``parameters`` is float64[2 m]: for each element the share that remains after a sample,
-    exp(-1 / (T f)), then for each its gain from x in a sample, s (1 - exp(-1 / (T f))). ``memory``
-    is float64[m + 1]: the elements, the previous x.
+    ``parameters`` is float64[2 m]: for each element the decay factor per sample, exp(-1 / (T f)),
+    then for each its gain from x per sample, s (1 - exp(-1 / (T f))). ``memory`` is float64[m + 1]:
+    the elements, the previous x.
     """
     for k in range(x.size):
         total = _crept(parameters, memory)
@@ -176,7 +176,7 @@ def creep_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 @kernel()
 def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
-    """Subtract the creep: the inverse of :func:`creep_block`."""
+    """Subtract the creep; the inverse of :func:`creep_block`."""
     for k in range(y.size):
         x = y[k] - _crept(parameters, memory)
         memory[memory.size - 1] = x
@@ -204,9 +204,10 @@ def _keep(position: float, velocity: float, x: float, memory: F64) -> None:
 def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Pass a displacement through a pair of antiresonance and resonance.
 
-    ``parameters`` is float64[12]: position and velocity after a sample, each from those before it
-    and from x before and after it; weights of position, velocity and x in the output; the weight of
-    x in the output of its own sample. ``memory`` is float64[3]: position, velocity, the previous x.
+    ``parameters`` is float64[12]: coefficients of position and velocity after a sample, each for
+    position, velocity and x before it and x after it; weights of position, velocity and x in the
+    output; the weight of x in the output of its own sample. ``memory`` is float64[3]: position,
+    velocity, the previous x.
     """
     for k in range(x.size):
         now = x[k]
@@ -237,7 +238,7 @@ def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
 def exponential(matrix: F64) -> F64:
     """Return exp(matrix), float64[m, m] finite: the Taylor series of a small part of it, squared.
 
-    It has 13 digits in common with SciPy's, whose import takes a run 0.2 s and 9 MB.
+    The result agrees with SciPy to 13 digits; importing SciPy would cost a run 0.2 s and 9 MB.
     """
     halvings = max(0, math.frexp(np.abs(matrix).sum(axis=1).max())[1] + 3)
     part = matrix * 0.5**halvings  # its norm is at most 1/8: the twelfth term is below 1e-19

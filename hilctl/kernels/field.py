@@ -1,31 +1,31 @@
 """Hysteresis of an effective field: plays and drags, and losses between command and field.
 
-Notation: ``v`` is a command, ``w`` the field behind the losses, ``m`` the operators' output,
-``u = w + coupling m`` the effective field, their input, and ``T`` the sample period. All operators
-are tables over even cells of ``u``, contiguous in memory for speed.
+Notation: ``v`` is a command, ``w`` the field after the losses, ``m`` the operators' output, ``u = w
++ coupling m`` the effective field (their input), and ``T`` the sample period. All operators are
+tables over even cells of ``u``, contiguous in memory for speed.
 
 A *play* of threshold r has the output q(F_r[u]); a line of them for each r is Preisach's triangle.
-With thermal activation a play F does not yield at once: while u is d ahead of it, it moves at
-F' = a exp((d - r) / k). So loops widen with the logarithm of the rate, and a held u creeps with the
-logarithm of time. A play of threshold 0 does not creep.
+With thermal activation a play F does not follow immediately: while u leads it by d, it moves at F'
+= a exp((d - r) / k). Therefore loops widen with the logarithm of the rate, and at constant u the
+output creeps with the logarithm of time. A play of threshold 0 does not creep.
 
 A *drag* of length k relaxes to the position s_u of u in a cell while u moves towards it:
-ds/d|u| = (s_u - s) / k, otherwise ds = 0. Unlike those of plays, its small loops creep. A sample
-moves every cell of a drag but one place in the table of a play, so drags have their own cells,
-which may be wider.
+ds/d|u| = (s_u - s) / k, otherwise ds = 0. Unlike minor loops of plays, minor loops of drags creep.
+A sample updates all cells of a drag but only one entry of a play's table, so drags have their own
+cells, which may be wider.
 
 The command leads the field by the losses, in the mean over a sample::
 
     v = w + z,  z + tau_b z' = h(e),  e = tau_0 w' + tau_1 m',
     h(e) = e (1 / (1 - g |e|) + b |e| + c e^2 + x / sqrt(|e| + e_0))
 
-The part with g is that of a lag that grows with its own loss, z = e (1 + g |z|). It has a pole,
-before which, at g |e| = 0.9, it continues along its tangent: so h rises for all e.
+The term with g describes a lag that grows with its own loss, z = e (1 + g |z|). It has a pole; from
+g |e| = 0.9 on it continues along its tangent, so h rises for all e.
 
 Memory, float64[p + d c + 3 d + 6]: the plays' outputs, each drag's in each of c cells relative to
 rest, three sums over each drag, then u, m, z, w, the last du/dv (du/dm in the inverse), and the
-previous input; NaN means that there is none yet. It is updated in place, so any cut into blocks
-gives the same bits.
+previous input; NaN means that there is none yet. It is updated in place, so any division into
+blocks gives the same bits.
 
 Sources: I. D. Mayergoyz, "Mathematical Models of Hysteresis", Springer 1991 (plays as Preisach's
 triangle); E. Della Torre, "Magnetic Hysteresis", IEEE Press 1999 (the moving model); D. C. Jiles,
@@ -47,22 +47,22 @@ p (n + 1)], weights of the drags in c cells, float64[d c], and the grid, float64
 width and n for the plays, width and c for the drags; k and a T / k of the creep of the plays."""
 Span: TypeAlias = tuple[float, float, float]
 Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
-"""tau_0 / T, tau_1 / T, what is left of z after a sample, b, c, x, g, e_0, the part that z
-before a sample has in its mean over the sample (the rest is h's), and the weight of w after a
-sample in its mean over the sample (the rest is that of w before)."""
+"""tau_0 / T, tau_1 / T, decay factor of z per sample, b, c, x, g, e_0, the weight of z before a
+sample in its mean over the sample (h has the rest), and the weight of w after a sample in its mean
+over the sample (w before it has the rest)."""
 
 _BEFORE_POLE = 0.9
 _STEPS = 100
 _NARROWEST = 1e-14
-_STILL, _SURE = -25.0, 300.0  # exponents of the creep without effect, and beyond which it is linear
-_NEAR = 1e-7  # of a change, and of its unit, to which it is worked out
+_STILL, _SURE = -25.0, 300.0  # exponents: creep is negligible below, linear above
+_NEAR = 1e-7  # relative and absolute precision of a computed change
 _OUTPUT, _COMMAND, _FIELD = 0, 1, 2
 
 
 @kernel(inline=True)
 def _cell(place: float, cells: float) -> int:
-    """Return the cell of a place; outside the cells, the nearest one."""
-    # What is not a number must not become an index.
+    """Return the cell of a position; outside the cells, the nearest one."""
+    # A NaN must not become an index.
     return int(min(place, cells - 1.0)) if place > 0.0 else 0
 
 
@@ -80,7 +80,7 @@ def dragged(held: float, low: float, width: float, last: float, way: float) -> f
     """Return a drag's output in a cell after the field has risen by ``way`` >= 0, in lengths.
 
     ``held`` is the output before, 0 to ``width``; ``low`` is the cell's lower end and ``last`` the
-    field before. Nothing moves before the field has passed ``low + held``.
+    field before. Nothing moves until the field has passed ``low + held``.
     """
     begin = max(last, low + held)
     end = last + way
@@ -105,7 +105,7 @@ def drag_step(held: float, low: float, width: float, last: float, u: float, leng
             held / length, low / length, width / length, last / length, (u - last) / length
         )
         return up * length
-    low, last, u = -(low + width), -last, -u  # downwards is upwards in a mirror
+    low, last, u = -(low + width), -last, -u  # downwards is upwards mirrored
     up = dragged(
         (width - held) / length, low / length, width / length, last / length, (u - last) / length
     )
@@ -120,7 +120,7 @@ def _rest(cell: int, lowest: float, width: float) -> float:
 
 @kernel()
 def mapped(x: float, knots: F64, values: F64) -> float:
-    """Return the value at ``x`` of a line through points, continued straight at its ends."""
+    """Return the value at ``x`` of a line through points, extrapolated at both ends."""
     low, high = 0, knots.size - 1
     while high - low > 1:
         middle = (low + high) // 2
@@ -136,7 +136,7 @@ def mapped(x: float, knots: F64, values: F64) -> float:
 def _drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> tuple[float, float]:
     """Return a drag's output at a next u, and its slope, without moving it.
 
-    All cells that the field has passed move alike, so their sums are enough.
+    All cells that the field has passed move alike, so sums over them suffice.
     """
     thresholds, lengths, _, weights, grid = bank
     lowest, width, cells = grid[0], grid[3], int(grid[4])
@@ -187,7 +187,7 @@ def _move_drag(u: float, last: float, i: int, memory: F64, bank: Bank) -> None:
 
 @kernel(inline=True)
 def _even(change: float, creep: float) -> tuple[float, float, float, float]:
-    """Return what plays that creep have in common while u changes evenly, see :func:`_play`.
+    """Return terms common to all creeping plays during a linear change of u, see :func:`_play`.
 
     These are the change over k, w; (exp(w) - 1) / w for |w| and for -|w|; and the slope of the
     logarithm of the first.
@@ -211,7 +211,7 @@ def _play(
     pace: float,
     even: tuple[float, float, float, float],
 ) -> tuple[float, float, float]:
-    """Return a play after u has changed evenly, its slope by u, and what is left of ``held``.
+    """Return a play after a linear change of u, its slope by u, and the remaining part of ``held``.
 
     ``creep`` is k, ``pace`` is a t / k for the time t of the change. While d changes at a rate R,
     p = F' / k obeys p' = p (R / k - p).
@@ -251,7 +251,7 @@ def play_paths(
     out: F64_2D,
     by: F64_2D,
 ) -> None:
-    """Fill in plays from rest along a path, and their slopes by the thresholds: float64[p, N] each.
+    """Compute plays from rest along a path, and their slopes by the thresholds: float64[p, N] each.
 
     ``step_s``, float64[n], is the time of each step of ``u``, ``creep`` k and ``rate`` a / k;
     ``rows`` is int64[N], the points that are filled in, rising.
@@ -327,12 +327,11 @@ def lost_field(e: float, losses: Losses) -> tuple[float, float]:
 
 @kernel(nogil=True)
 def field_left(v: F64, late: F64, step_s: F64, m: F64, losses: Losses, w: F64) -> None:
-    """Compute the field behind the losses of a command, for known outputs ``m`` of the operators.
+    """Compute the field after the losses of a command, for known outputs ``m`` of the operators.
 
-    ``v`` is the command after a part, ``late``, at least half, of the step that ends at each
-    sample, which takes ``step_s``; ``w`` is filled, the first with the first command: float64[n]
-    each. The first three of ``losses`` are in s, the third tau_b itself, and the last two are not
-    used.
+    ``v`` is the command at the fraction ``late``, >= 0.5, of the step that ends at each sample and
+    takes ``step_s``; ``w`` is filled, the first with the first command: float64[n] each. The first
+    three ``losses`` are in s, the third is tau_b itself, and the last two are unused.
     """
     w[0] = v[0]
     z = change = before = 0.0
@@ -389,7 +388,7 @@ def _root(
         guess = u + (target - memory[ends + 5]) * memory[ends + 4]
         u = guess if low < guess < high else u
     if what == _OUTPUT and memory[ends + 4] > 0.0 and low < u < high and not bank[4][5] > 0.0:
-        # What u gives is known unless plays creep, and the next step goes about as the last one.
+        # The result for u is known unless plays creep, and the next step resembles the last one.
         short = target - memory[ends + 1]
         if abs(short) <= tolerance:
             return u, memory[ends + 1]
@@ -422,10 +421,10 @@ def _root(
 def _advance(
     what: int, target: float, span: Span, memory: F64, bank: Bank, coupling: float, losses: Losses
 ) -> float:
-    """Advance by a sample with a known output or command, and return the other of the two."""
+    """Advance by a sample with a known output (or command), and return the command (or output)."""
     k = memory.size - 6
     fresh = math.isnan(memory[k + 5])
-    # The first command counts as having stood there for ever: nothing of it is lost.
+    # The first command counts as constant until then, so it has no losses.
     given = _FIELD if fresh and what == _COMMAND else what
     u, m = _root(given, target, span, memory, bank, coupling, losses)
     w = u - coupling * m
@@ -460,10 +459,10 @@ def field_forward(
     """Run the model, with ``bank``, ``losses`` and ``memory`` as above.
 
     ``v`` is float64[n], commands, each held through the sample that ends with its output; one that
-    is not finite gives NaN and leaves no trace. ``span`` is the lowest and highest effective field,
-    and the tolerance of a root, > 0; ``coupling`` is the effective field per unit of the operators'
-    output; ``curve`` is that output and the displacement in um, float64[k] each, both rising.
-    ``out`` is float64[n], filled with um.
+    is not finite gives NaN and does not change the memory. ``span`` is the lowest and highest
+    effective field, and the tolerance of a root, > 0; ``coupling`` is the effective field per unit
+    of the operators' output; ``curve`` is that output and the displacement in um, float64[k] each,
+    both rising. ``out`` is float64[n], filled with um.
     """
     for k in range(v.size):
         if abs(v[k]) < math.inf:
@@ -484,10 +483,10 @@ def field_inverse(
     memory: F64,
     out: F64,
 ) -> None:
-    """Run the inverse; arguments as for :func:`field_forward`, with um in and commands out.
+    """Run the inverse from um to commands; arguments as for :func:`field_forward`.
 
-    The field of an output is a root of a rising function, and the rest is explicit, so it inverts
-    :func:`field_forward` to within the tolerance throughout the span.
+    The field of an output is the root of a rising function, and the rest is explicit, so the result
+    inverts :func:`field_forward` to within the tolerance throughout the span.
     """
     for k in range(y.size):
         if abs(y[k]) < math.inf:

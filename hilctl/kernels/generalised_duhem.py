@@ -1,20 +1,19 @@
 """A generalised Duhem operator: slopes of rising and of falling branches over a band.
 
-Notation: ``v`` is a command, ``w`` the field behind the losses, ``y`` a displacement, ``T`` the
+Notation: ``v`` is a command, ``w`` the field after the losses, ``y`` a displacement, ``T`` the
 sample period. The operator is the differential equation
 
     dy/dw = g_up(y, w - c(y)) rising, g_down(y, w - c(y)) falling,  |w - c(y)| <= b,
 
 with positive slopes g, bilinear between the nodes of a grid, and a rising centre line c. At the
-edge of the band w moves with the centre. The midpoint rule integrates it in steps of y that are
-short enough for w to rise with y: so each displacement has one field, and each field one
-displacement.
+edge of the band w moves with the centre. The midpoint rule integrates in steps of y that are short
+enough for w to rise with y, so each displacement has one field, and each field one displacement.
 
 The command leads the field by the losses of :mod:`hilctl.kernels.field`. Their output m is a flux
 m(y) that rises with y.
 
 Memory, float64[4]: y, w and z, then the previous input; NaN means that there is none yet. It is
-updated in place, so any cut into blocks gives the same bits.
+updated in place, so any division into blocks gives the same bits.
 
 Sources: B. D. Coleman and M. L. Hodgdon, "A constitutive relation for rate-independent hysteresis
 in ferromagnetically soft materials", Int. J. Eng. Sci. 24 (1986) 897; J. Oh and D. S. Bernstein,
@@ -39,21 +38,21 @@ k]; lowest y, distance of nodes of y, half the band's width b, distance of nodes
 
 _BEFORE_POLE = 0.9
 _STEPS = 100
-_MOST_STEPS = 1000  # of y in a sample; the rest of a jump goes by the slope that it begins with
-_SMALLEST_SCALE = 1e-100  # of the factor that derivatives share; a smaller one may become 0
+_MOST_STEPS = 1000  # of y in a sample; the rest of a jump uses the slope at its start
+_SMALLEST_SCALE = 1e-100  # of the common factor of the derivatives; a smaller one may become 0
 _NEAR_UM = 1e-9
 
 
 @kernel(inline=True)
 def _cell(place: float, cells: float) -> int:
-    """Return the cell of a place; outside the cells, the nearest one."""
-    # A place that is not a number, from a memory that is none, must not become an index.
+    """Return the cell of a position; outside the cells, the nearest one."""
+    # NaN from an invalid memory must not become an index.
     return int(min(place, cells - 1.0)) if place > 0.0 else 0
 
 
 @kernel(inline=True)
 def _along(y: float, lines: F64_2D, line: int, grid: F64) -> float:
-    """Return the centre (line 0) or the flux (line 1) at a y, continued straight at its ends."""
+    """Return the centre (line 0) or the flux (line 1) at a y, extrapolated at both ends."""
     place = (y - grid[0]) / grid[1]
     i = _cell(place, lines.shape[1] - 1.0)
     return float(lines[line, i] + (lines[line, i + 1] - lines[line, i]) * (place - i))
@@ -79,7 +78,8 @@ def _followed(y: float, w: float, target: float, band: Band) -> tuple[float, flo
     way = 0 if target >= y else 1
     by_y, going, k = 0.0, True, 0
     while going:
-        # Whole steps, then what is left: so that the field at the end is continuous in the target.
+        # Whole steps, then the remainder, so that the final field is a continuous function of the
+        # target.
         first, _, i, j, _, _ = _slope(y, w - _along(y, lines, 0, grid), way, slopes, grid)
         rest = target - y
         going = abs(rest) > steps[way, i, j] and k < _MOST_STEPS
@@ -104,7 +104,7 @@ def _share_out(
     slopes: F64_3D,
     by_node: F64,
 ) -> None:
-    """Distribute the derivative by a slope to the derivatives by the logarithms of four nodes."""
+    """Share the derivative by a slope among the derivatives by the logarithms of four nodes."""
     _, _, i, j, a, b = found
     stride = slopes.shape[2]
     node = (way * slopes.shape[1] + i) * stride + j
@@ -118,7 +118,7 @@ def _share_out(
 def duhem_columns(
     y: F64, start_y: float, start_w: float, band: Band, rows: I64, w: F64, out: F64_2D
 ) -> None:
-    """Follow a path, and compute the dependence of the fields on the logarithm of each slope.
+    """Compute the fields along a path, and their derivatives by the logarithm of each slope.
 
     ``y`` is float64[n], the path from ``start_y`` and ``start_w``; ``rows`` is int64[N], points
     that are filled in, rising. ``w`` is float64[n], filled with the field, ``out`` float64[N, m]; m
@@ -147,7 +147,7 @@ def duhem_columns(
             field = min(max(free, centre - grid[2]), centre + grid[2])
             part += 1
             if by_node.size:
-                inside = 1.0 if field == free else 0.0  # the edge of the band forgets
+                inside = 1.0 if field == free else 0.0  # the edge of the band has no memory
                 gain = -inside * dy / half[0] ** 2
                 to_half = -0.5 * dy / first[0] ** 2
                 scale *= inside + gain * half[1] * (1.0 + to_half * first[1])
@@ -195,7 +195,7 @@ def _moved(y: float, memory: F64, band: Band, losses: Losses) -> tuple[float, fl
 
 @kernel()
 def _root(command: float, memory: F64, band: Band, losses: Losses) -> float:
-    """Return the y of a command; of a field before the first sample.
+    """Return the y of a command, or of a field before the first sample.
 
     Newton's steps within the bounds from the signs so far; bisection if a step leaves these.
     """
@@ -227,7 +227,8 @@ def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> 
     """Run the model.
 
     ``v`` is float64[n], commands, each held through the sample that ends with its output; a command
-    that is not finite gives NaN and leaves no trace. ``out`` is float64[n], filled with y.
+    that is not finite gives NaN and does not change the memory. ``out`` is float64[n], filled with
+    y.
     """
     for k in range(v.size):
         if abs(v[k]) < math.inf:
@@ -242,11 +243,11 @@ def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> 
 
 @kernel()
 def duhem_inverse(y: F64, band: Band, losses: Losses, memory: F64, out: F64) -> None:
-    """Run the inverse, which is explicit; y in and commands out, see :func:`duhem_forward`."""
+    """Run the explicit inverse from y to commands, see :func:`duhem_forward`."""
     for k in range(y.size):
         if abs(y[k]) < math.inf:
             w, z, command, _ = _moved(y[k], memory, band, losses)
-            if math.isnan(memory[3]):  # it counts as having stood there for ever
+            if math.isnan(memory[3]):  # the first value counts as constant until then
                 z, command = 0.0, w
             memory[0], memory[1], memory[2], memory[3] = y[k], w, z, y[k]
             out[k] = command

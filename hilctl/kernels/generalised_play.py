@@ -2,12 +2,12 @@
 
 A generalised play has the output ``max(gamma_l(v) - r, min(gamma_r(v) + r, held))`` (1.17). If
 ``gamma_l <= gamma_r``, all of them are ordinary plays of one signal z, the generalised play of
-threshold 0: so the model is a sum of plays of z, and its inverse is the inverse sum of plays
-before the inverse envelopes. Each envelope is ``c tanh(k v + s) + o``; where the falling one would
-lie below the rising one, it follows the rising one.
+threshold 0. Therefore the model is a sum of plays of z, and its inverse is the inverse sum of plays
+before the inverse envelopes. Each envelope is ``c tanh(k v + s) + o``; the falling one follows the
+rising one instead of going below it.
 
 Memory, float64[m + 2]: m play outputs, z, then the previous command (NaN: none yet, which is 0).
-It is updated in place, so any cut into blocks gives the same bits. Signals are float64[n].
+It is updated in place, so any division into blocks gives the same bits. Signals are float64[n].
 
 Source: section 2.2.6 of "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis
 Nonlinearities of Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.
@@ -74,7 +74,7 @@ def envelope_forward(
 def envelope_outputs(
     v: F64, envelopes: Envelopes, thresholds: F64, memory: F64, out: F64_2D
 ) -> None:
-    """Record z and each play's output by itself, as regressors for identification.
+    """Compute z and the output of each play separately, as regressors for identification.
 
     ``thresholds`` are those of :data:`EnvelopedPlays`; ``out`` is float64[n, m + 1], z first.
     """
@@ -100,10 +100,10 @@ def envelope_inverse(
 ) -> None:
     """Run the inverse: the inverse sum of plays, then the inverse envelopes.
 
-    While z rises the command follows the inverse of gamma_l, while it falls that of gamma_r; the
-    command jumps where z turns and is constant where z is. ``y`` is float64[n], displacement in
-    um; commands stay within ``span``. ``plays`` are those of the inverse sum, with thresholds in
-    um.
+    The command follows the inverse of gamma_l while z rises, and the inverse of gamma_r while z
+    falls. It jumps when z turns, and is constant while z is constant. ``y`` is float64[n],
+    displacement in um; commands stay within ``span``. ``plays`` are those of the inverse sum, with
+    thresholds in um.
     """
     rising, falling = envelopes
     low, high = span

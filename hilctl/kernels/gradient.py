@@ -1,13 +1,14 @@
 """An operator of plays after a model, its inverse, and the adaptation of its parameters.
 
 The operator is x + g (x - c) + sum w_i (P_i[x] - c_i), in um, with x the sum of a model's output
-and an offset: the difference between actuator and model. The offset comes first, so that x stays in
-the range of the references. It is a Prandtl-Ishlinskii operator, with an exact inverse if 1 + g and
-all sums 1 + g + w_1 + ... + w_i are above 0: K. Kuhnen and H. Janocha, "Adaptive inverse control of
-piezoelectric actuators with hysteresis operators", Proc. European Control Conference (1999).
+and an offset. It describes the difference between actuator and model. The offset comes first, so
+that x stays in the range of the references. It is a Prandtl-Ishlinskii operator, with an exact
+inverse if 1 + g and all sums 1 + g + w_1 + ... + w_i are above 0: K. Kuhnen and H. Janocha,
+"Adaptive inverse control of piezoelectric actuators with hysteresis operators", Proc. European
+Control Conference (1999).
 
-The adapted parameters are not o, g and w_i, whose regressors are similar, but those of regressors
-orthogonalised one after the other. So a step or a bound of one does not affect another.
+The adapted parameters are not o, g and w_i, whose regressors are similar, but the coefficients of
+successively orthogonalised regressors, so a step or bound of one does not affect another.
 """
 
 import math
@@ -16,7 +17,7 @@ from typing import TypeAlias
 from hilctl.base.types import F64, F64_2D, I64, U32
 from hilctl.kernels.jit import kernel
 
-OFFSET, GAIN, WEIGHTS = range(3)  # places of the parameters; the weights go on from there
+OFFSET, GAIN, WEIGHTS = range(3)  # indices of the parameters; the weights follow
 BOUND, CENTRE, POWER = range(3)  # rows of what belongs to each, see the functions
 MIDDLE_UM, HALF_UM, LARGEST_UM, DEAD_UM2, RATE, SMOOTHING, LEAK, COUNT = range(8)
 SETTINGS = 8
@@ -33,7 +34,7 @@ thresholds  float64[m - 2], rising, in half spans
 DelayLines: TypeAlias = tuple[F64, F64, I64]
 """References (float64[d + 1]) and inputs (float64[e + 1]), and the positions in both (int64[2]).
 
-They delay by the d and e samples from a reference and an input to the displacement that shows it.
+Their lengths d and e are the delays in samples from a reference and an input to its displacement.
 """
 
 _FURTHEST = 4.0  # half spans from the middle: the steps are not designed for inputs beyond
@@ -83,9 +84,9 @@ def adapted_input(
 ) -> None:
     """Convert requested displacements to a model's input, in place, by the operator's inverse.
 
-    Values of ``input_um``, float64[n], that are not finite stay, and move no play. ``before`` and
-    ``after`` ``size`` >= n samples, o, g and w_i are float64[m]; between, they change linearly.
-    ``memory`` is float64[m - 1], of the plays.
+    Values of ``input_um``, float64[n], that are not finite stay unchanged and move no play.
+    ``before`` and ``after`` ``size`` >= n samples, o, g and w_i are float64[m]; between, they
+    change linearly. ``memory`` is float64[m - 1], of the plays.
     """
     settings, table, _shape, thresholds = operator
     middle, half = settings[MIDDLE_UM], settings[HALF_UM]
@@ -136,7 +137,7 @@ def regressor_sums(
 
 @kernel(inline=True)
 def _delayed(value: float, line: F64, places: I64, which: int) -> float:
-    """Put a value into a delay line, and return its oldest one; the same value in a line of one."""
+    """Put a value into a delay line and return the oldest one; a line of one returns the value."""
     at = places[which]
     line[at] = value
     at = (at + 1) % line.size
@@ -158,8 +159,8 @@ def _excess(found: F64, table: F64_2D, count: float) -> float:
 def _step(size: int, operator: Operator, state: F64_2D) -> None:
     """Move the parameters by ``size`` samples of the smoothed gradient, within their bounds.
 
-    The dead zone applies to the part of the squared error that a gradient explains: below it, that
-    may be noise.
+    The dead zone applies to the part of the squared error that a gradient explains, because a small
+    part may be noise.
     """
     settings, table, shape, _thresholds = operator
     pace, dead = size * settings[RATE], settings[DEAD_UM2]
@@ -169,7 +170,7 @@ def _step(size: int, operator: Operator, state: F64_2D) -> None:
         share = 1.0 - math.sqrt(dead / max(explained, dead, 1e-300))
         most = pace * bound
         step = min(most, max(-most, pace * share * gradient / table[POWER, j]))
-        kept = 1.0 - pace * settings[LEAK] * min(j, 1)  # not of the offset, which always shows
+        kept = 1.0 - pace * settings[LEAK] * min(j, 1)  # no leakage of the offset
         state[VALUE, j] = min(bound, max(-bound, kept * state[VALUE, j] + step))
     for i in range(state.shape[1]):
         form = state[VALUE, i]
@@ -191,9 +192,9 @@ def adapt_block(
 ) -> int:
     """Compare a block's displacements with the references due, and step the parameters.
 
-    Ignored are samples with a flag, displacements that show the reference or input of such a
-    sample, and errors that are larger than the parameters can cause: they are no change of the
-    actuator. A block without any other sample changes nothing.
+    Samples with a flag, displacements caused by the reference or input of such a sample, and errors
+    larger than the parameters can cause are ignored, because they show no change of the actuator. A
+    block without any other sample changes nothing.
 
     Args:
         reference_um: float64[n].
@@ -203,7 +204,8 @@ def adapt_block(
         operator: Its constants.
         lines: Delay lines, NaN for samples to ignore.
         memory: float64[m - 1], of the plays.
-        state: float64[5, m], parameters, the same as o, g and w_i, smoothed gradient, scratch.
+        state: float64[5, m], parameters, their conversion to o, g and w_i, smoothed gradient,
+            scratch.
 
     Returns:
         Number of samples used.

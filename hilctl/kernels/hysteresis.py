@@ -1,12 +1,12 @@
 """Play, stop and deadband operators, their weighted sums, and the integrated model.
 
 Notation: ``v`` is an input, ``x`` the signal between plays and deadbands, ``y`` an output. The
-*widening* is the rate's addition to every threshold: ``r_i(v') = r_i + gamma |v'|`` (6.18).
+*widening* is the rate-dependent part of every threshold: ``r_i(v') = r_i + gamma |v'|`` (6.18).
 
 Memory of a sum of m plays, float64[m + 1]: the m operator outputs, then the previous input. NaN
-means that there is none yet: then the rate is zero, and an operator with output 0 starts at
-``max(v_0 - r, min(v_0 + r, 0))`` as in the literature. Memory is updated in place, so any cut into
-blocks gives the same bits. ``out`` may be the input array itself.
+means that there is none yet; then the rate is zero, and an operator with output 0 starts at
+``max(v_0 - r, min(v_0 + r, 0))`` as in the literature. Memory is updated in place, so any division
+into blocks gives the same bits. ``out`` may be the input array itself.
 
 Source: "Modeling and Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of
 Magnetostrictive Actuators", Concordia; equation numbers are that dissertation's.
@@ -88,8 +88,8 @@ def play_sum_shared(
 ) -> None:
     """Sum weighted plays whose widening, float64[n] >= 0, is given for each sample.
 
-    Two sums with the same widening cancel exactly if one is the other's inverse. ``direct``,
-    ``thresholds`` and ``weights`` are those of :data:`Plays`.
+    Two mutually inverse sums with the same widening cancel exactly. See :data:`Plays` for
+    ``direct``, ``thresholds`` and ``weights``.
     """
     for k in range(v.size):
         now = v[k]
@@ -100,7 +100,7 @@ def play_sum_shared(
 
 @kernel(inline=True)
 def play_sum(v: F64, plays: Plays, memory: F64, out: F64) -> None:
-    """Sum weighted plays whose thresholds widen with the input's own rate (3.6, 5.5).
+    """Sum weighted plays whose thresholds widen with the rate of the input (3.6, 5.5).
 
     ``v`` and ``out`` are float64[n].
     """
@@ -156,7 +156,7 @@ def integrated_inverse(y: F64, deadbands: Deadbands, plays: Plays, memory: F64, 
     """Run the integrated inverse Omega^-1[y] = Pi^-1[Lambda^-1(y)] (6.17).
 
     The parameters are those of the inverse operators; ``y`` and ``out`` are float64[n]. The
-    previous input in ``memory`` is that of the plays, Lambda^-1(y).
+    previous input in ``memory`` is the input of the plays, Lambda^-1(y).
     """
     deadband_block(y, deadbands, out)
     play_sum(out, plays, memory, out)

@@ -1,6 +1,7 @@
 """Models without an analytic inverse: Preisach, Krasnosel'skii-Pokrovskii, Bouc-Wen.
 
-For a given memory, the displacement never falls with the next command, so the inverse is a root.
+For a given memory, the displacement is a non-decreasing function of the next command, so the
+inverse is a root.
 
 A model is a number and three arrays. Preisach (0): thresholds r_i, float64[m]; q_i at the edges of
 c cells, float64[m (c + 1)]; lowest edge, width of a cell, c. Krasnosel'skii-Pokrovskii (1): alpha,
@@ -8,8 +9,8 @@ float64[m]; beta, float64[m]; weights, then the ridge's width. Bouc-Wen (2): dir
 beta, gamma, exponent (1 or 2); the other two are not used.
 
 Memory, float64[m + 1]: the operators' outputs (z of Bouc-Wen), then the previous command; NaN means
-that there is none yet, and Bouc-Wen then begins at 0. It is updated in place, so any cut of a
-signal into blocks gives the same bits.
+that there is none yet, and Bouc-Wen then begins at 0. It is updated in place, so any division into
+blocks gives the same bits.
 
 Source: sections 2.2 and 2.3 of "Modeling and Compensation of Rate-Dependent Asymmetric
 Hysteresis Nonlinearities of Magnetostrictive Actuators", Concordia.
@@ -93,7 +94,7 @@ def _preisach(v: float, memory: F64, thresholds: F64, values: F64, cells: F64) -
     for i in range(thresholds.size):
         held = max(min(memory[i], v + thresholds[i]), v - thresholds[i])
         place = (held - low) / width
-        # A place that is not a number, from a memory that is none, must not become an index.
+        # NaN from an invalid memory must not become an index.
         cell = float(math.floor(min(place, count - 1.0))) if place > 0.0 else 0.0
         j = i * stride + int(cell)
         total += values[j] + (values[j + 1] - values[j]) * (place - cell)
@@ -201,7 +202,7 @@ def _root(
     end = high if near_short > 0.0 else low
     step = (high - low) * (_FIRST_STEP if near_short > 0.0 else -_FIRST_STEP)
     while near != end:
-        far = max(low, min(high, near + step)) if step != 0.0 else end  # a span of nearly nothing
+        far = max(low, min(high, near + step)) if step != 0.0 else end  # a negligible span
         far_short = target - _peek(kind, far, memory, arrays)
         if (far_short > 0.0) != (near_short > 0.0):
             found = (near, far), (near_short, far_short)
@@ -220,10 +221,11 @@ def implicit_inverse(
     memory: F64,
     out: F64,
 ) -> None:
-    """Run a model's inverse, root by root; its memory is that of the model.
+    """Run the inverse of a model, one root per sample, with the memory of the model.
 
-    ``y`` is float64[n], displacement in um; a value that is not finite gives NaN and leaves no
-    trace. Commands stay within ``span``; the model misses y by ``tolerance`` > 0 um at most.
+    ``y`` is float64[n], displacement in um; a value that is not finite gives NaN and does not
+    change the memory. Commands stay within ``span``; the model's deviation from y is at most
+    ``tolerance`` > 0 um.
     """
     for k in range(y.size):
         target = y[k]

@@ -1,8 +1,8 @@
 """Interlocks on the samples of a run: all of them in one pass, with memory between blocks.
 
-Settings and memory are arrays with a named place for each number, so that one call per block is
-enough; see :class:`hilctl.loop.interlocks.Interlocks` for their meaning. A time is a whole number
-of samples; an infinite one disables its interlock.
+Settings and memory are arrays with a named index for each number, so one call per block is enough;
+see :class:`hilctl.loop.interlocks.Interlocks` for their meaning. A time is a whole number of
+samples; an infinite one disables its interlock.
 """
 
 from enum import IntFlag
@@ -57,8 +57,8 @@ def _invalid(displacement_um: float, settings: F64) -> int:
 def _frozen(displacement_um: float, command: float, settings: F64, memory: F64) -> int:
     """Count the samples with a constant reading after the command has travelled.
 
-    Time counts from the moment of sufficient travel, so that a hold, however long, or a step after
-    one does not look like a dead sensor.
+    The count starts when the travel is sufficient, so a constant command of any duration, or a step
+    after it, does not look like a dead sensor.
     """
     reading, run = memory[READING], memory[FROZEN_RUN]
     low, high = min(memory[LOWEST], command), max(memory[HIGHEST], command)
@@ -75,8 +75,8 @@ def _frozen(displacement_um: float, command: float, settings: F64, memory: F64) 
 def _deviating(measured: float, command: float, settings: F64, memory: F64) -> int:
     """Count the samples with a deviation of the measured command.
 
-    A reading may be taken before or after its own command takes effect, so it is compared with the
-    span of this command and the previous one. NaN always deviates.
+    A reading may be taken before or after its command takes effect, so it is compared with the span
+    of this command and the previous one. NaN always deviates.
     """
     previous, away = memory[COMMAND], settings[DEVIATION]
     low, high = min(previous, command) - away, max(previous, command) + away
@@ -91,7 +91,7 @@ def _deviating(measured: float, command: float, settings: F64, memory: F64) -> i
 def _warmed(heat: float, command: float, measured: float, warming: float) -> float:
     """Advance d(heat)/dt = (current^2 - heat) / tau by one sample of constant current."""
     load = command * command
-    if load < measured * measured < float("inf"):  # what is not finite was not measured
+    if load < measured * measured < float("inf"):  # a value that is not finite was not measured
         load = measured * measured
     return heat + (load - heat) * warming
 
@@ -105,7 +105,7 @@ def _too_hot(command: float, measured: float, settings: F64, memory: F64) -> int
 
 @kernel(inline=True)
 def _off_track(reference: float, displacement_um: float, settings: F64, memory: F64) -> int:
-    """Count the samples with too large an error; without a reference (NaN) there is none."""
+    """Count the samples with too large an error; a sample without a reference (NaN) has none."""
     run = memory[TRACKING_RUN] + 1.0
     if not abs(reference - displacement_um) > settings[TRACKING_UM]:
         run = 0.0
@@ -128,10 +128,10 @@ def interlock_block(
     A missing reading (NaN) is flagged, and trips if too many follow one another. It neither ends
     nor continues the time of the other conditions on readings.
 
-    Signals are float64[n]: the command and the measured one in A or V, the others in um; a
-    reference or measured command that is missing is NaN. The bits of invalid readings and of each
-    tripped interlock are added to ``flags``. ``settings`` is float64[14], ``memory`` float64[9],
-    updated in place; any cut into blocks gives the same bits.
+    Signals are float64[n]: command and measured command in A or V, the others in um; a missing
+    reference or measured command is NaN. The bits of invalid readings and of each tripped interlock
+    are added to ``flags``. ``settings`` is float64[14], ``memory`` float64[9], updated in place;
+    any division into blocks gives the same bits.
     """
     first = -1
     for k in range(command.size):

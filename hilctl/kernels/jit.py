@@ -1,7 +1,6 @@
 """The decorator of all kernels.
 
-numba is imported at the first use of a kernel, because commands that compute nothing need not wait
-for it.
+numba is imported at the first use of a kernel, so commands that compute nothing do not wait for it.
 """
 
 import os
@@ -21,7 +20,7 @@ Function = TypeVar("Function", bound=Callable[..., object])
 
 @cache
 def _numba() -> Any:
-    """Import numba, and register the type of a kernel that another kernel calls."""
+    """Import numba, and register the type of kernels called by other kernels."""
     import numba
     from numba.extending import typeof_impl
 
@@ -112,7 +111,8 @@ def kernel(*, inline: bool = False, nogil: bool = False) -> Callable[[Function],
     Args:
         inline: Always inline it into the kernels that call it: for those called once per sample.
             Such a kernel must not use an array inside ``if`` or leave a loop by ``break``: numba
-            then counts references to its arrays at every call, which takes longer than the work.
+            then counts references to its arrays at every call, which takes longer than the
+            computation.
         nogil: Release the interpreter lock during a call: for long work beside other threads. No
             other thread may change its arrays meanwhile.
 
@@ -130,9 +130,9 @@ def kernel(*, inline: bool = False, nogil: bool = False) -> Callable[[Function],
 
 
 def compiled(function: Function) -> Function:
-    """Return the compiled function of a kernel: a call of it has no Python frame in between.
+    """Return the compiled function of a kernel, which is called without a Python frame.
 
-    Compiles it now, or loads it from the cache. Any other function is returned unchanged.
+    It is compiled now, or loaded from the cache. Any other function is returned unchanged.
     """
     return function.dispatcher if isinstance(function, _Kernel) else function
 
@@ -140,7 +140,7 @@ def compiled(function: Function) -> Function:
 def ensure_compiled(*kernels: object) -> None:
     """Compile kernels now, or load them from the cache, so that their first call does not wait.
 
-    Objects that are no kernels are ignored.
+    Objects other than kernels are ignored.
     """
     for each in kernels:
         if isinstance(each, _Kernel):

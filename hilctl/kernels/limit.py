@@ -1,4 +1,4 @@
-"""Limits of a command: range first, slew second, both in one pass, and the way down."""
+"""Limits of a command: range first, then slew, in one pass."""
 
 from hilctl.base.types import F64, U32
 from hilctl.kernels.jit import kernel
@@ -21,7 +21,8 @@ def limit_block(
 
     A request that is not finite is replaced by the last command. No step is larger than
     ``max_step`` > 0. If ``previous``, the last command, lies within [low, high], every result does;
-    otherwise the results return by whole steps. The bit of each reason is added to the flags.
+    otherwise the results return in steps of ``max_step``. The bit of each reason is added to the
+    flags.
 
     Return the index of the first request that is not finite, or -1.
     """

@@ -1,17 +1,18 @@
-"""The residual of a model: an operator of the modelled displacement.
+"""The residual of a model as an operator on the modelled displacement.
 
-With ``x`` the displacement by a model, relative to rest, that of the actuator is x + R[x], and
+With ``x`` the displacement of a model relative to rest, the displacement of the actuator is x +
+R[x], and
 
     R[x] = sum q_i(F_i[x]) + sum (a_i(x) s_i + b_i(x) s_i^2) + c(x) rate
 
 *Plays* F_i have rising thresholds; *drags* s_i of lengths l_i, -1 to 1, relax along the path of x,
 ds = (sign(dx) - s) |dx| / l; *rate*, -1 to 1, is the change of x over a window of samples, relative
-to the fastest one. All tables are lines through the same even edges of ``x``, constant outside. So
-R is bounded for any history, and so is the inverse, the root of x + R[x] = y.
+to the fastest one. All tables are piecewise linear with the same even nodes of ``x``, and constant
+outside. Therefore R and the inverse, the root of x + R[x] = y, are bounded for any history.
 
 Memory, float64[p + d + n + 2]: the plays' outputs, the drags', ``x`` of the last n samples of the
 window, the last slope dx / dy, and the previous input; NaN means that there is none yet. It is
-updated in place, so any cut into blocks gives the same bits.
+updated in place, so any division into blocks gives the same bits.
 
 Sources: I. D. Mayergoyz, "Mathematical Models of Hysteresis", Springer 1991 (plays as Preisach's
 triangle); P. R. Dahl, "Solid friction damping of mechanical vibrations", AIAA J. 14 (1976) 1675
@@ -29,7 +30,7 @@ from hilctl.kernels.jit import kernel
 Tables: TypeAlias = tuple[F64, F64, F64, F64, F64]
 """Thresholds float64[p], lengths float64[d], tables of the plays at the edges of c cells, float64[
 p (c + 1)], those of a, b and c, float64[(2 d + 1) (c + 1)], and the grid: lowest edge, width of a
-cell, c, change of x in a window that counts as rate 1, most that R can be either way."""
+cell, c, change of x in a window that counts as rate 1, bound of |R|."""
 
 _STEPS = 60
 _TOLERANCE_UM = 1e-6
@@ -37,7 +38,7 @@ _TOLERANCE_UM = 1e-6
 
 @kernel(inline=True)
 def _within(place: float, cells: float) -> float:
-    """Return a place limited to the cells; 0 for NaN."""
+    """Return a position limited to the cells; 0 for NaN."""
     return min(place, cells) if place > 0.0 else 0.0
 
 
@@ -86,7 +87,7 @@ def _settle(x: float, given: float, memory: F64, tables: Tables) -> None:
         for k in range(plays + drags, last):
             memory[k] = memory[k + 1]
         memory[last] = x
-    else:  # it counts as having stood there for ever
+    else:  # the first value counts as constant until then
         for k in range(plays + drags, last + 1):
             memory[k] = x
     memory[last + 2] = given
@@ -102,7 +103,7 @@ def _fastest(memory: F64, tables: Tables) -> float:
 def residual_forward(x: F64, tables: Tables, memory: F64, out: F64) -> None:
     """Return x + R[x] in ``out``, float64[n], for ``x``, float64[n], in um.
 
-    A value that is not finite gives NaN and leaves no trace.
+    A value that is not finite gives NaN and does not change the memory.
     """
     for k in range(x.size):
         now = x[k]
@@ -139,7 +140,7 @@ def _root(y: float, memory: F64, tables: Tables) -> float:
             low = x
         before, missed_before = x, missed
         x -= slope * missed
-        # A secant across a corner may leave the bounds, or creep: halves end it.
+        # A secant across a corner may leave the bounds or converge slowly; bisection ends it.
         if not low < x < high or step % 8 == 7:
             x = 0.5 * (low + high)
     return x
