@@ -47,7 +47,6 @@ _HELP = {
         "hilctl.cli.recordings": {
             "list": "List the recordings in a folder (reads metadata only).",
             "export": "Export a recording's samples to CSV, NumPy, Parquet or MATLAB.",
-            "facts": "Print the facts of a recording's start and end.",
             "recover": "Repair a truncated recording; the original is kept as RUN.torn.",
         },
         "hilctl.cli.reports": {

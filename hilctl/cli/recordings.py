@@ -14,11 +14,10 @@ from hilctl.analysis.export import export_all
 from hilctl.api.tables import RunTable
 from hilctl.base.errors import InputError
 from hilctl.base.formatting import finite_json, printable
-from hilctl.cli.console import listing, print_rich, progress_bar
+from hilctl.cli.console import progress_bar
 from hilctl.cli.options import AsJson, FromTime, Overwrite, ToTime, recordings_argument
 from hilctl.cli.output import print_json, print_result
 from hilctl.recording.metadata_keys import RECORDINGS
-from hilctl.recording.reader import read as read_recording
 from hilctl.recording.recover import recover_recording
 from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.run_folder import dismiss
@@ -106,16 +105,6 @@ def _export_all(folder: Path, output: Path, *, as_json: bool) -> None:
             print(f"hilctl: {path}: not exported: {why}", file=sys.stderr)
     if done.left_out:
         raise typer.Exit(1)
-
-
-def facts(
-    recording: Annotated[Path, recordings_argument("Recording (MCAP).")], as_json: AsJson = False
-) -> None:
-    """Print the facts of a recording's start and end."""
-    found = read_recording(recording)
-    values = {"run": dict(found.run), "end": dict(found.end)}
-    rows = {f"{part}.{name}": text for part, each in values.items() for name, text in each.items()}
-    print_result(values, lambda: print_rich(listing("", rows.items())), as_json=as_json)
 
 
 def recover(

@@ -96,8 +96,3 @@ def test_damaged_run_is_dismissed_by_name(hilctl):
 def test_recover_needs_either_run_or_name(hilctl, words):
     code, _, err = hilctl("recover", *words)
     assert (code, "--dismiss" in err) == (2, True)
-
-
-def test_facts_of_start_and_end(json_of):
-    _, facts = json_of("facts", str(GOLDEN / "piezo_compensated.mcap"))
-    assert (facts["run"]["command_unit"], facts["end"]["code"]) == ("V", "completed")
