@@ -83,8 +83,8 @@ class DacDevice(ABC):
         """Connect, check that the device is what it should be, and set it up; nothing moves.
 
         Raises:
-            DeviceError: It can't be reached, is another device, refuses a step, or can't keep this
-                rate or block.
+            DeviceError: It is unreachable, is another device, refuses a step, or does not support
+                this rate or block.
         """
         self.close()
         try:
@@ -270,7 +270,7 @@ class DacDevice(ABC):
 
     def _look(self) -> DeviceReadings:
         """Connect, and return the readings without their correction; :meth:`_release` follows."""
-        raise DeviceError("it can't be read without being set up")
+        raise DeviceError("it cannot be read without being set up")
 
     @abstractmethod
     def _exchange(

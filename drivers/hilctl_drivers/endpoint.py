@@ -123,7 +123,7 @@ def reader_of(options: DacOptions, writer: Endpoint) -> Endpoint:
 def _on_the_line_of(writer: Endpoint, reader: Endpoint) -> Endpoint:
     """Return the reader with the line settings of the output's device, whose line it shares."""
     profile, line, mine = reader.profile, writer.profile.link, reader.profile.link
-    rule = f"{profile.title} can't share the line of {writer.profile.title} at {writer.place}"
+    rule = f"{profile.title} cannot share the line of {writer.profile.title} at {writer.place}"
     remedy = "give reader.host or reader.serial_port, another one, if it has a link of its own"
     differ = [key for key in line.COMMON if getattr(line, key, None) != getattr(mine, key, None)]
     if type(profile) is not type(writer.profile) or reader.framing != writer.framing:

@@ -122,11 +122,11 @@ class _Plan:
             raise InputError("fault reset is for tcp: a serial line has no connection to break")
 
     def _may_share(self, wanted: ReaderLine | None) -> bool:
-        """Return whether the reader is on the line of the device; raise InputError if it can't."""
+        """Return whether the reader is on the line of the device; raise InputError if it cannot."""
         profile, reader = self._profile, self._reader
         alike = type(profile) is type(reader) and reader.link.kind not in {"bytes", "frames"}
         if wanted == "same" and not alike:
-            raise InputError(f"{reader.title} can't share the line of {profile.title}: use own")
+            raise InputError(f"{reader.title} cannot share the line of {profile.title}: use own")
         shares = wanted or ("same" if reader.link.kind == "rtu" else "own")
         links = {(each.tcp, each.framing) for each in (self._served, self._shown)}
         return alike and shares == "same" and len(links) == 1

@@ -139,7 +139,7 @@ class WriteLog:
                             raise InputError(f"{path}: is no log of a device: give another name")
                 self._file = path.open("wb", buffering=0)
             except OSError as error:
-                raise InputError(f"{path}: can't be written: {reason(error)}") from None
+                raise InputError(f"{path}: cannot be written: {reason(error)}") from None
 
     def event(self, now_ns: int, event: str, **more: Any) -> None:
         """Write one line; ``now_ns`` is monotonic time, ``more`` are plain values."""

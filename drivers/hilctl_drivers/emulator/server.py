@@ -139,7 +139,7 @@ class EmulatorServer:
             listener = socket.create_server((host, port))
         except OSError as error:
             why = reason(error, ADDRESS_REMEDIES)
-            raise InputError(f"can't listen on {host}:{port}: {why}") from None
+            raise InputError(f"cannot listen on {host}:{port}: {why}") from None
         self._listeners[listener] = wire
         self._wires.append(wire)
         self._selector.register(listener, selectors.EVENT_READ)

@@ -223,7 +223,7 @@ class LabJackWire(RegisterWire):
         options, profile = setup.options, self._profile
         streaming = profile.streaming
         if streaming == "none":
-            raise InputError(f"{profile.title} can't stream: take kind: modbus_dac, and block: 1")
+            raise InputError(f"{profile.title} cannot stream: take kind: modbus_dac, and block: 1")
         if setup.reads_elsewhere:
             raise InputError("reader must be omitted: input and output are in one scan list")
         for key in ("digital_output", "digital_input"):
@@ -313,7 +313,7 @@ class LabJackWire(RegisterWire):
         # The stream first: it would write over the safe value with its next scan.
         try:
             feedback(write_frame(ENABLE, u32(0)), write)
-        except RefusedError:  # a stream that does not run can't be stopped
+        except RefusedError:  # a stream that does not run cannot be stopped
             feedback(write)
 
     def _read_back(self) -> float:

@@ -93,7 +93,7 @@ class RegisterFormat:
         """
         raw = (value - self.offset) / self.scale
         if not isfinite(raw):
-            raise BadRequestError(f"{self.type} register can't hold {value}")
+            raise BadRequestError(f"{self.type} register cannot hold {value}")
         try:
             data = self._pack(round(raw) if self.is_integer else raw)
         except (struct.error, OverflowError):
@@ -192,7 +192,7 @@ class Channel(Register, Range):
     @model_validator(mode="after")
     def _range_fits_register(self) -> Self:
         if self.type == "bit":
-            raise ValueError(f"an analogue channel can't be in area {self.area}")
+            raise ValueError(f"an analogue channel cannot be in area {self.area}")
         if self.type.startswith("float") and (self.raw_min, self.raw_max) != (None, None):
             raise ValueError("raw_min and raw_max are for whole-number types")
         low, high = _RAW_LIMITS[self.format.type]

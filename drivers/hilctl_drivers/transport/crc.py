@@ -66,8 +66,8 @@ def crc16_modbus(data: Bytes) -> int:
 
 
 MODBUS_WORDS = _modbus_table(16)
-"""For loops that can't afford a call: ``crc = MODBUS_WORDS[crc ^ word]`` is :func:`crc16_modbus` of
-two bytes, the first the low one of ``word``, in less than half the time."""
+"""For loops in which a call is too slow: ``crc = MODBUS_WORDS[crc ^ word]`` is :func:`crc16_modbus`
+of two bytes, the low byte of ``word`` first, in less than half the time."""
 
 
 CRCS: Mapping[str, Crc] = MappingProxyType({crc.name: crc for crc in (

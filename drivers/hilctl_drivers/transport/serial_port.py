@@ -120,7 +120,7 @@ class SerialLink(StreamLink):
             text = reason(error, PORT_REMEDIES) if isinstance(error, OSError) else str(error)
             if self._settings.rs485 is not None and isinstance(error, ValueError):
                 text += " (omit rs485 if the adapter switches its direction itself)"
-            raise LostError(f"can't be opened: {text}") from None
+            raise LostError(f"cannot be opened: {text}") from None
         # Otherwise an FTDI adapter holds bytes back for up to 16 ms; ptys and USB CDC refuse it.
         if isinstance(port, serial.Serial):
             with contextlib.suppress(OSError, ValueError, NotImplementedError):

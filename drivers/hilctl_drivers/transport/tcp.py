@@ -32,7 +32,7 @@ def _connected(address: tuple[str, int], timeout_s: float) -> tuple[socket.socke
     except TimeoutError:
         raise LostError(f"no connection within {timeout_s:g} s") from None
     except OSError as error:
-        raise LostError(f"can't connect: {why(error, CONNECT_REMEDIES)}") from None
+        raise LostError(f"cannot connect: {why(error, CONNECT_REMEDIES)}") from None
     try:
         made.setsockopt(socket.IPPROTO_TCP, socket.TCP_NODELAY, 1)
         # What is not acknowledged by then is given up, also where this process dies: else the
@@ -42,7 +42,7 @@ def _connected(address: tuple[str, int], timeout_s: float) -> tuple[socket.socke
         return made, str(made.getpeername()[0])
     except OSError as error:  # reset since
         made.close()
-        raise LostError(f"can't connect: {why(error)}") from None
+        raise LostError(f"cannot connect: {why(error)}") from None
 
 
 class _Connection:

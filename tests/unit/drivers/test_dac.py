@@ -116,7 +116,7 @@ def test_an_unplugged_port_is_an_error_everywhere(rig, kind):
     bench.open()
     with pytest.raises(DeviceError, match="unplugged"):
         exchange_until_it_fails(bench)
-    with pytest.raises(DeviceError, match="can't be opened"):
+    with pytest.raises(DeviceError, match="cannot be opened"):
         bench.device.make_safe(0.0)
     bench.device.close()
 
@@ -379,7 +379,7 @@ def test_nobody_there_is_said(rig):
     away = SerialDac(
         SerialOptions.model_validate({**bench.emulator.options, "serial_port": "/dev/ttyNOWHERE"})
     )
-    with pytest.raises(DeviceError, match=r"/dev/ttyNOWHERE: can't"):
+    with pytest.raises(DeviceError, match=r"/dev/ttyNOWHERE: cannot"):
         away.open(20.0, 1)
     bench.open()
     second = SerialDac(SerialOptions.model_validate(bench.emulator.options))
@@ -397,7 +397,7 @@ def test_nobody_there_is_said(rig):
     ({"watchdog": {"timeout_s": 100.0}}, "timeout_s must be 0.1 to 25.5"),
     ({"watchdog": {"timeout_s": 1.0, "safe_command": 11.0}}, "safe_command must be -10 to 10"),
     ({"sensor": {"um_per_ma": 1.0}}, "the input is in V"),
-    ({"reader": {"profile": "agilent_34970a"}, "input": "AI101"}, "can't share the line"),
+    ({"reader": {"profile": "agilent_34970a"}, "input": "AI101"}, "cannot share the line"),
 ])  # fmt: skip
 def test_options_that_do_not_go_together_are_refused(profiles, changes, text):
     dcon = {**TWO_LINES, "profile": profiles["dcon"], "input": "AI0", "reader": None}

@@ -122,7 +122,7 @@ BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {AO + "type": "bit"}, "type must not be bit in area holding"),
     ("modbus", {AO + "type": "float32", AO + "function": 6}, "function 6 writes one register"),
     ("modbus", {"inputs.AI.area": "discrete", "inputs.AI.type": "bit"},
-     "inputs.AI: an analogue channel can't be in area discrete"),
+     "inputs.AI: an analogue channel cannot be in area discrete"),
     ("modbus", {"exchange": 23}, "inputs.AI.area must be holding: exchange 23 reads holding"),
     ("modbus", {"init": [{"kind": "write", "address": 1, "type": "uint16"}]},
      "init.0.value: is required"),

@@ -77,7 +77,7 @@ def test_rods_keep_to_the_range_of_the_sensor(emulate, um_per_v, stroke_um):
     ("waveshare_ao_8ch", {}, "has no input to show a displacement at: name a reader"),
     ("waveshare_ai_8ch", {}, "has no output to drive .*: it can be another one's reader"),
     ("adam_4024", {"reader": "kepco_bop"}, "Kepco .* has no input to show a displacement at"),
-    ("kepco_bop", {"reader": "labjack_t7", "reader_line": "same"}, "can't share the line"),
+    ("kepco_bop", {"reader": "labjack_t7", "reader_line": "same"}, "cannot share the line"),
     ("kepco_bop", {"reader": "agilent_34970a", "reader_unit_id": 2}, "is for Modbus"),
     ("cobs_board", {"command": 1.0}, "is for Modbus"),
     ("icp_m7024_dcon", {}, "has no input to show a displacement at: name a reader"),
@@ -100,5 +100,5 @@ def test_second_port_in_use_leaves_nothing_open(served):
 
 
 def test_log_that_can_not_be_written_is_refused(served, tmp_path):
-    with pytest.raises(InputError, match="can't be written"):
+    with pytest.raises(InputError, match="cannot be written"):
         served("labjack_t7", log=tmp_path / "none" / "log.jsonl")

@@ -311,7 +311,7 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
 
 
 @pytest.mark.parametrize(("changes", "text"), [
-    ({"profile": "labjack_t8"}, "LabJack T8 can't stream: take kind: modbus_dac"),
+    ({"profile": "labjack_t8"}, "LabJack T8 cannot stream: take kind: modbus_dac"),
     ({"output": "TDAC0"}, "output must be one that LabJack T7 can stream, DAC0, DAC1"),
     ({"reader": {"profile": "labjack_t4", "host": "10.0.0.9"}}, "reader must be omitted"),
 ])  # fmt: skip

@@ -158,7 +158,7 @@ class TestReader:
         faults = (parse_fault("silence@1s"),)
         served = serve("icp_m7024", "icp_m7017", reader_line="own", faults=faults)
         device, other = served.running(5.0, timeout_s=0.5), served.device()
-        with pytest.raises(DeviceError, match="can't be opened"):
+        with pytest.raises(DeviceError, match="cannot be opened"):
             other.open(5.0, 1)
         served.clock.pass_s(2.0)
         with pytest.raises(DeviceError, match="reader icp_m7017"):
@@ -183,7 +183,7 @@ class TestReader:
 
     def test_no_reader_there_moves_nothing(self, serve):
         served = serve("adam_6224", "adam_6217")
-        said = r"reader adam_6217, unit 1 at 127\.0\.0\.1:1: can't connect: .* \(to open\)"
+        said = r"reader adam_6217, unit 1 at 127\.0\.0\.1:1: cannot connect: .* \(to open\)"
         with pytest.raises(DeviceError, match=said):
             served.device(reader={**served.emulator.options["reader"], "tcp_port": 1}).open(5.0, 1)
         assert served.events() == []

@@ -81,12 +81,12 @@ def test_float32_refuses_what_only_a_double_holds():
 @pytest.mark.parametrize("kind", ["int16", "uint16", "int32", "uint32", "float32", "float64"])
 @pytest.mark.parametrize("value", [math.nan, math.inf, -math.inf])
 def test_nothing_that_is_not_a_number_is_sent(kind, value):
-    with pytest.raises(BadRequestError, match="can't hold"):
+    with pytest.raises(BadRequestError, match="cannot hold"):
         RegisterFormat(kind).encode(value)
 
 
 def test_scaling_past_the_doubles_is_refused():
-    with pytest.raises(BadRequestError, match="can't hold"):
+    with pytest.raises(BadRequestError, match="cannot hold"):
         RegisterFormat("float64", scale=1e-300).encode(1e300)
 
 

@@ -194,7 +194,7 @@ class TestExchange:
 
     def test_nobody_there(self):
         device = made(host="127.0.0.1", tcp_port=1)
-        words = r"modbus_dac labjack_t7 at 127\.0\.0\.1:1: can't connect: .* \(to open\)"
+        words = r"modbus_dac labjack_t7 at 127\.0\.0\.1:1: cannot connect: .* \(to open\)"
         with pytest.raises(DeviceError, match=words):
             device.open(100.0, 1)
         with pytest.raises(DeviceError, match="make safe, DAC0"):

@@ -86,7 +86,7 @@ def test_serial_exchanges(line):
 
 def test_serial_port_is_ours_alone(line):
     first, second = serial(line[1]), SerialLink(line[1], line_settings(), QUICK_S)
-    with pytest.raises(LostError, match=r"can't be opened: .*lock"):
+    with pytest.raises(LostError, match=r"cannot be opened: .*lock"):
         second.open()
     first.close()
     second.open()

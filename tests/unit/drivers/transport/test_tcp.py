@@ -130,7 +130,7 @@ def test_tcp_reset_closing_and_refusal_are_told_apart(serve):
 
 
 def test_tcp_unknown_host_is_one_line():
-    with pytest.raises(LostError, match="can't connect"):
+    with pytest.raises(LostError, match="cannot connect"):
         TcpLink("host.invalid", 502, QUICK_S).open()
 
 
