@@ -4,18 +4,19 @@ The error of a sample is the distance of its measured point from the nearest poi
 path, which joins the references by straight lines. A lag along the path is no contour error; it is
 the along-path error, from the sample's reference to the nearest point.
 
-The nearest point is searched around the sample's reference, in a window of time, so that another
-branch of the path is not taken: a quarter of the period of the fastest axis before and after. Two
-branches of a Lissajous figure cross at least a whole one of these periods apart, two turns of a
-spiral lie one apart. An axis whose reference is no sine has the period of the sine with its rms
-deviation and rms speed. A lag of more than the window is reported as limited samples.
+The nearest point is searched on the stretch of the path around the sample's reference: before and
+after it by twice the distance of the measured point from that reference. The way along the path is
+at most 1.1 times that distance for a lag of 90 degrees on a circle, and 1.4 times around a right
+angle. Another branch of the path that passes nearby is farther away along the path: two branches of
+a Lissajous figure that cross, and two turns of a spiral, are a period of the fastest axis apart or
+more, and the flyback of a raster is as far away as the end of the line.
 """
 
 import json
 import logging
 import math
 from collections import deque
-from collections.abc import Callable, Iterable, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, fields
 from functools import partial, reduce
 from pathlib import Path
@@ -24,7 +25,7 @@ from typing import Any
 import numpy as np
 import numpy.typing as npt
 
-from hilctl.analysis.report import Windows, build_report
+from hilctl.analysis.report import build_report
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import DataError
 from hilctl.base.formatting import finite, printable, quantity, shown_briefly
@@ -36,7 +37,7 @@ from hilctl.recording.recording import Recording
 from hilctl.recording.run_summary import read_ends, recordings_in
 
 MOST_REACH = 2**17
-"""Longest window before and after a sample, in samples."""
+"""Longest lag or lead that is searched, in samples."""
 
 _TOGETHER = 2**17  # samples
 _TRACED = 2**18  # samples of all segments
@@ -52,7 +53,7 @@ class ContourMetrics:
         peak_um: Largest contour error.
         along_mean_um: Mean along-path error; negative if the axes lag.
         lag_s: Mean lag: the mean along-path error over the mean speed of the reference.
-        limited_samples: Samples whose nearest point is at the end of the window.
+        limited_samples: Samples with :data:`MOST_REACH` of lag or lead, perhaps more.
     """
 
     samples: int
@@ -73,12 +74,10 @@ class ContourSegment(ContourMetrics):
     Attributes:
         labels: The waveform of each axis.
         start_s: Time of the first evaluated sample since the start of the run.
-        window_s: Longest time between a sample's reference and its nearest point.
     """
 
     labels: tuple[str, ...]
     start_s: float
-    window_s: float
 
 
 @shown_briefly
@@ -112,7 +111,7 @@ def contour_rows(report: ContourReport) -> list[tuple[str, str]]:
          f"{um(report.mean_um)} mean"),
         ("along the path", f"{along}, {um(report.along_peak_um)} peak"),
         ("lag", quantity(report.lag_s, "s")),
-        *([("at the end of the window", limited)] if report.limited_samples else []),
+        *([("largest lag searched", limited)] if report.limited_samples else []),
     ]  # fmt: skip
     first, *_ = report.axes
     return [
@@ -129,14 +128,13 @@ def contour_rows(report: ContourReport) -> list[tuple[str, str]]:
 
 def contour_table(report: ContourReport) -> tuple[list[str], list[list[str]]]:
     """Return headings and rows of all segments."""
-    headings = ["segment", "start s", "peak µm", "rms µm", "mean µm", "lag ms", "window ms"]
+    headings = ["segment", "start s", "peak µm", "rms µm", "mean µm", "lag ms"]
     return headings, [
         [
             "; ".join(map(printable, each.labels)),
             f"{each.start_s:g}",
             *map(quantity, (each.peak_um, each.rms_um, each.mean_um)),
             quantity(None if each.lag_s is None else 1e3 * each.lag_s),
-            quantity(1e3 * each.window_s),
         ]
         for each in report.segments
     ]
@@ -144,26 +142,30 @@ def contour_table(report: ContourReport) -> tuple[list[str], list[list[str]]]:
 
 @dataclass(frozen=True, slots=True)
 class ContourTrace:
-    """Last evaluated samples of a segment, whole cycles of all axes if it repeats.
+    """Samples with their nearest points of the reference path.
 
     Attributes:
-        t_s: float64[n], time since the start of the run.
-        reference_um: float64[n, axes]; likewise the others.
-        nearest_um: Nearest points of the reference path.
-        along_um: float64[n], along-path error.
+        index: int64[n].
+        reference_um: float64[n, axes]; likewise the measured and the nearest points.
+        error_um: float64[n], contour error; likewise the others.
+        along_um: Along-path error.
+        away: Lag or lead, in samples.
+        step_um: Length of the path from the reference before.
     """
 
-    t_s: F64
+    index: I64
     reference_um: F64
     measured_um: F64
     nearest_um: F64
+    error_um: F64
     along_um: F64
+    away: F64
+    step_um: F64
 
-    @property
-    def error_um(self) -> F64:
-        """Contour error: float64[n]."""
-        error_um: F64 = np.linalg.norm(self.measured_um - self.nearest_um, axis=1)
-        return error_um
+    def part(self, start: int, stop: int) -> "ContourTrace":
+        """Return the samples from an index up to another."""
+        low, high = np.searchsorted(self.index, (start, stop)).tolist()
+        return ContourTrace(*(getattr(self, each.name)[low:high] for each in fields(self)))
 
 
 def recordings_by_axis(paths: Sequence[Path]) -> dict[str, Path]:
@@ -205,23 +207,36 @@ def _names(run: Mapping[str, str]) -> list[str]:
 def contour(
     runs: Mapping[str, Iterable[Recording]],
 ) -> tuple[ContourReport, tuple[ContourTrace | None, ...]]:
-    """Return the contour errors of a run, and a trace of each segment, None without samples.
+    """Return the contour errors of a run, and the last samples of each segment, None without any.
+
+    If the waveforms of all axes repeat together, they are those of one such period.
 
     ``runs`` are the recordings of its axes by name, as repeatable iterables of pieces, which are
     read two or three times, in bounded memory. Raise DataError as
     :func:`hilctl.analysis.report.summarize` does, or if their rates differ.
     """
-    surveys = [_Survey(pieces) for pieces in runs.values()]
-    reports = {name: each.report for name, each in zip(runs, surveys, strict=True)}
+    builders = {name: build_report(pieces) for name, pieces in runs.items()}
+    reports = {name: each.report() for name, each in builders.items()}
     rates_hz = {each.sample_rate_hz for each in reports.values()}
     if len(rates_hz) > 1:
         given = ", ".join(f"{name}: {each.sample_rate_hz:g} Hz" for name, each in reports.items())
         raise DataError(f"the axes of a run must have one sample rate: {given}")
     rate_hz = rates_hz.pop()
-    stretches = reduce(_overlaps, (each.stretches() for each in surveys))
+    stretches = reduce(
+        _overlaps,
+        (
+            [
+                _Stretch((segment.label,), start, stop, (segment.period,))
+                for segment, (start, stop, _) in each.windows
+            ]
+            for each in builders.values()
+        ),
+    )
     total, skew = _Errors(rate_hz), _Skew([*runs][1:])
     parts = [_Part(each, rate_hz, total, _TRACED // len(stretches)) for each in stretches]
-    _read_together([*runs.values()], parts, skew)
+    for found in _evaluated(_common([*runs.values()], skew)):
+        for part in parts:
+            part.add(found)
     segments = tuple(part.segment() for part in parts)
     report = ContourReport(
         **total.metrics(), axes=reports, skew_us=skew.figures_us(), segments=segments
@@ -231,16 +246,11 @@ def contour(
 
 @dataclass(frozen=True, slots=True)
 class _Stretch:
-    """Evaluated samples of one segment of each axis.
-
-    ``quarter`` is that of the period of the fastest axis, in samples; ``periods`` are those of the
-    waveforms.
-    """
+    """Evaluated samples of one segment of each axis, and the periods of its waveforms."""
 
     labels: tuple[str, ...]
     start: int
     stop: int
-    quarter: float
     periods: tuple[float, ...]
 
     def overlap(self, other: "_Stretch") -> "_Stretch":
@@ -248,7 +258,6 @@ class _Stretch:
             self.labels + other.labels,
             max(self.start, other.start),
             min(self.stop, other.stop),
-            min(self.quarter, other.quarter),
             self.periods + other.periods,
         )
 
@@ -269,52 +278,45 @@ def _overlaps(some: list[_Stretch], others: list[_Stretch]) -> list[_Stretch]:
     return [each for each in found if each.start < each.stop]
 
 
-class _Survey:
-    """The report of one axis, its evaluated samples, and the pace of its reference in them."""
+def _evaluated(common: Iterable[Sequence[npt.NDArray[Any]]]) -> Iterator[ContourTrace]:
+    """Yield the samples that all axes have, with their nearest points of the path between them.
 
-    def __init__(self, pieces: Iterable[Recording]) -> None:
-        self._windows: Windows = []
-        self._paces: list[_Pace] = []
-        self.report = build_report(pieces, self._observe).report()
-
-    def _observe(self, windows: Windows) -> Callable[[Recording], None]:
-        self._windows, self._paces = windows, [_Pace() for _ in windows]
-        return self._add
-
-    def _add(self, piece: Recording) -> None:
-        for (_, (start, stop, _)), pace in zip(self._windows, self._paces, strict=True):
-            if piece.samples.index.size and start <= piece.samples.index[-1]:
-                pace.add(piece.samples.part(start, stop).reference_um)
-
-    def stretches(self) -> list[_Stretch]:
-        return [
-            _Stretch((segment.label,), start, stop, pace.quarter(), (segment.period,))
-            for (segment, (start, stop, _)), pace in zip(self._windows, self._paces, strict=True)
-        ]
+    The pieces have the index int64[n], reference and displacement float64[n, axes].
+    """
+    held: list[npt.NDArray[Any]] = []
+    first = 0
+    for piece in common:
+        held = (
+            [np.concatenate(each) for each in zip(held, piece, strict=True)] if held else [*piece]
+        )
+        end = held[0].size - MOST_REACH
+        if end - first >= _TOGETHER:
+            yield _nearest(held, first, end)
+            held = [each[max(0, end - MOST_REACH) :] for each in held]
+            first = min(end, MOST_REACH)
+    if held and held[0].size > 1:
+        yield _nearest(held, first, held[0].size)
 
 
-class _Pace:
-    """Rms deviation of a reference, and its rms step."""
-
-    def __init__(self) -> None:
-        self._first: float | None = None
-        self._sums = np.zeros(5)  # of 1, value, its square; 1, and square of a step
-
-    def add(self, reference_um: F64) -> None:
-        known = reference_um[np.isfinite(reference_um)]
-        if known.size:
-            self._first = float(known[0]) if self._first is None else self._first
-            since, steps = known - self._first, np.diff(known)
-            sums = since.size, since.sum(), float(since @ since), steps.size, float(steps @ steps)
-            self._sums += np.array(sums)
-
-    def quarter(self) -> float:
-        """Return a quarter of the period of such a sine, in samples; infinite at rest."""
-        values, total, squares, steps, step_squares = self._sums.tolist()
-        if not step_squares:
-            return math.inf
-        variance = max(squares / values - (total / values) ** 2, 0.0)
-        return 0.5 * math.pi * math.sqrt(variance * steps / step_squares)
+def _nearest(rows: Sequence[npt.NDArray[Any]], first: int, end: int) -> ContourTrace:
+    """Return some rows that are completely known."""
+    index, path_um, points_um = rows
+    at = np.arange(first, end)
+    at = at[np.isfinite(points_um[at]).all(axis=1)]
+    steps_um = np.append(0.0, np.linalg.norm(np.diff(path_um, axis=0), axis=1))
+    arc_um, measured_um, whole = np.cumsum(steps_um), points_um[at], np.arange(index.size)
+    error_um, place = np.empty(at.size), np.empty(at.size)
+    nearest_on_path(path_um, arc_um, measured_um, at, MOST_REACH, error_um, place)
+    return ContourTrace(
+        index[at],
+        path_um[at],
+        measured_um,
+        np.column_stack([np.interp(place, whole, each) for each in path_um.T]),
+        error_um,
+        np.interp(place, whole, arc_um) - arc_um[at],
+        np.abs(place - at),
+        steps_um[at],
+    )
 
 
 class _Errors:
@@ -326,16 +328,14 @@ class _Errors:
         self._sums = np.zeros(5)  # of error, its square, along, its square, and step of the path
         self._peaks = np.zeros(2)  # of both errors
 
-    def add(self, error_um: F64, along_um: F64, step_um: F64, limited: int) -> None:
-        """Add samples; the errors, and the step of the reference to each: float64[n]."""
-        if not error_um.size:
-            return
-        self._samples += error_um.size
-        self._limited += limited
-        for k, values in enumerate((error_um, along_um)):
+    def add(self, found: ContourTrace) -> None:
+        """Add at least one sample."""
+        self._samples += found.index.size
+        self._limited += int(np.count_nonzero(found.away >= MOST_REACH))
+        for k, values in enumerate((found.error_um, found.along_um)):
             self._sums[2 * k : 2 * k + 2] += values.sum(), values @ values
             self._peaks[k] = max(self._peaks[k], np.abs(values).max())
-        self._sums[4] += step_um.sum()
+        self._sums[4] += found.step_um.sum()
 
     def metrics(self) -> dict[str, Any]:
         """Return the fields of :class:`ContourMetrics`."""
@@ -350,77 +350,40 @@ class _Errors:
 
 
 class _Part:
-    """Contour errors of a stretch, in pieces; they are also added to those of the run."""
+    """Contour errors of a stretch; they are also added to those of the run."""
 
     def __init__(self, stretch: _Stretch, rate_hz: float, total: _Errors, most_traced: int) -> None:
         self._stretch, self._rate_hz, self._total = stretch, rate_hz, total
-        self._reach = int(min(max(stretch.quarter, 1.0), MOST_REACH))
-        self._beside = self._reach + 1  # a row more than a window tells that the path goes on
-        self._next = stretch.start
-        self._held: list[npt.NDArray[Any]] = []
         self._traced = min(stretch.traced(), max(most_traced, 2))
-        self._traces: deque[list[F64]] = deque()
+        self._traces: deque[ContourTrace] = deque()
         self._errors = _Errors(rate_hz)
 
-    def add(self, rows: Sequence[npt.NDArray[Any]]) -> None:
-        """Take the next samples, also those around the stretch that its windows reach.
-
-        They are the index int64[n], reference and displacement float64[n, axes].
-        """
-        around = self._stretch.start - self._beside, self._stretch.stop + self._beside
-        low, high = np.searchsorted(rows[0], around).tolist()
-        if low == high:
+    def add(self, found: ContourTrace) -> None:
+        """Take the next samples, also those outside the stretch."""
+        mine = found.part(self._stretch.start, self._stretch.stop)
+        if not mine.index.size:
             return
-        held = [[], [], []] if not self._held else [[each] for each in self._held]
-        self._held = [
-            np.concatenate([*before, each[low:high]])
-            for before, each in zip(held, rows, strict=True)
-        ]
-        if self._held[0].size > 2 * self._beside + _TOGETHER:
-            self._evaluate(self._held[0].size - self._beside)
-
-    def finish(self) -> None:
-        """Evaluate what is left, after the last samples."""
-        if self._held and self._held[0].size > 1:
-            self._evaluate(self._held[0].size)
-
-    def _evaluate(self, end: int) -> None:
-        """Evaluate rows before ``end``, and keep those that later windows reach."""
-        index, path_um, points_um = self._held
-        first, last = np.searchsorted(index, (self._next, self._stretch.stop)).tolist()
-        self._next = int(index[end - 1]) + 1
-        at = np.arange(first, max(min(last, end), first))
-        at = at[np.isfinite(points_um[at]).all(axis=1)]
-        rows, points_um = np.arange(index.size), points_um[at]
-        steps_um = np.append(0.0, np.linalg.norm(np.diff(path_um, axis=0), axis=1))
-        arc_um = np.cumsum(steps_um)
-        error_um, place = np.empty(at.size), np.empty(at.size)
-        limited = nearest_on_path(path_um, arc_um, points_um, at, self._reach, error_um, place)
-        along_um = np.interp(place, rows, arc_um) - arc_um[at]
         for errors in (self._errors, self._total):
-            errors.add(error_um, along_um, steps_um[at], limited)
-        nearest_um = np.column_stack([np.interp(place, rows, each) for each in path_um.T])
-        columns = (index[at] / self._rate_hz, path_um[at], points_um, nearest_um, along_um)
-        self._traces.append([each[-self._traced :] for each in columns])
-        traced = sum(each[0].size for each in self._traces)
-        while traced - self._traces[0][0].size >= self._traced:
-            traced -= self._traces.popleft()[0].size
-        self._held = [each[max(0, end - self._beside) :] for each in self._held]
+            errors.add(mine)
+        self._traces.append(mine.part(int(mine.index[-self._traced :][0]), self._stretch.stop))
+        traced = sum(each.index.size for each in self._traces)
+        while traced - self._traces[0].index.size >= self._traced:
+            traced -= self._traces.popleft().index.size
 
     def segment(self) -> ContourSegment:
         return ContourSegment(
             **self._errors.metrics(),
             labels=self._stretch.labels,
             start_s=self._stretch.start / self._rate_hz,
-            window_s=self._reach / self._rate_hz,
         )
 
     def trace(self) -> ContourTrace | None:
         """Return the last samples; None without any."""
-        columns = [
-            np.concatenate(each)[-self._traced :] for each in zip(*self._traces, strict=True)
-        ]
-        return ContourTrace(*columns) if columns and columns[0].size else None
+        if not self._traces:
+            return None
+        names = [each.name for each in fields(ContourTrace)]
+        columns = ([getattr(each, name) for each in self._traces] for name in names)
+        return ContourTrace(*(np.concatenate(each)[-self._traced :] for each in columns))
 
 
 class _Skew:
@@ -487,26 +450,21 @@ class _Join:
         return [common, *found]
 
 
-def _read_together(
-    runs: Sequence[Iterable[Recording]], parts: Sequence[_Part], skew: _Skew
-) -> None:
-    """Read all axes at the same pace, and evaluate what they have in common."""
+def _common(runs: Sequence[Iterable[Recording]], skew: _Skew) -> Iterator[list[npt.NDArray[Any]]]:
+    """Read all axes at the same pace, and yield the samples that they have in common."""
     heads = [iter(pieces) for pieces in runs]
     samples, ticks = _Join(len(runs)), _Join(len(runs))
     reached = [-1] * len(runs)
     while True:
         axis = reached.index(min(reached))
         if (piece := next(heads[axis], None)) is None:
-            break  # nothing more is in common
+            return  # nothing more is in common
         if piece.samples.index.size:
             reached[axis] = int(piece.samples.index[-1])
-        if rows := samples.add(axis, *_columns(piece.samples)):
-            for part in parts:
-                part.add(rows)
         if found := ticks.add(axis, piece.ticks.first_sample, piece.ticks.late_ns):
             skew.add(found[1])
-    for part in parts:
-        part.finish()
+        if rows := samples.add(axis, *_columns(piece.samples)):
+            yield rows
 
 
 def _columns(samples: Samples) -> tuple[I64, F64, F64]:

@@ -220,9 +220,9 @@ DEFINITIONS = {
         "over the peak-to-peak reference."
     ),
     "contour error": (
-        "Distance of the measured point from the nearest point of the reference path, searched "
-        "within a quarter of the period of the fastest axis. The error along the path, from the "
-        "reference to the nearest point, is apart from it; negative if the axes lag."
+        "Distance of the measured point from the nearest point of the reference path around the "
+        "sample's reference. The error along the path, from the reference to the nearest point, is "
+        "apart from it; negative if the axes lag."
     ),
     "asymmetry": (
         "Difference of the highest and the lowest displacement from rest, over the peak-to-peak."

@@ -34,7 +34,8 @@ def contour_page(
     peaks = [each.peak_um or 0.0 for each in report.segments]
     if peaks and (trace := traces[worst := peaks.index(max(peaks))]) is not None:
         names = ["; ".join(map(short_name, each.labels)) for each in report.segments]
-        sheets = contour_sheets(trace, [*report.axes], names[worst])
+        first = next(iter(report.axes.values()))
+        sheets = contour_sheets(trace, [*report.axes], names[worst], first.sample_rate_hz)
     axes = (
         part
         for name, each in report.axes.items()
@@ -52,9 +53,11 @@ def contour_page(
     return html.document(title, body)
 
 
-def contour_sheets(trace: ContourTrace, axes: Sequence[str], label: str) -> list[FigureSpec]:
+def contour_sheets(
+    trace: ContourTrace, axes: Sequence[str], label: str, rate_hz: float
+) -> list[FigureSpec]:
     """Return the path of the first two axes with a magnified error, and the errors over time."""
-    error_um = trace.error_um
+    error_um, t_s = trace.error_um, trace.index / rate_hz
     times = magnification(trace)
     path_um = trace.nearest_um + times * (trace.measured_um - trace.nearest_um)
     largest = int(np.argmax(error_um))
@@ -74,11 +77,11 @@ def contour_sheets(trace: ContourTrace, axes: Sequence[str], label: str) -> list
         panel.set(xlabel=f"{axes[0]}, µm", ylabel=f"{axes[1]}, µm")
 
     def across(panel: Axes) -> None:
-        draw_line(panel, trace.t_s, error_um, ERROR)
+        draw_line(panel, t_s, error_um, ERROR)
         panel.set(xlabel="time, s", ylabel="contour error, µm")
 
     def along(panel: Axes) -> None:
-        draw_line(panel, trace.t_s, trace.along_um, DISPLACEMENT)
+        draw_line(panel, t_s, trace.along_um, DISPLACEMENT)
         panel.axhline(0.0, color=QUIET, linewidth=0.6)
         panel.set(xlabel="time, s", ylabel="along the path, µm")
 

@@ -90,19 +90,19 @@ class TestCircle:
         assert report.samples == 2000
         assert report.limited_samples == 0
 
-    @pytest.mark.parametrize("lag", [0.3, -0.3, 1.4])
+    @pytest.mark.parametrize("lag", [0.3, -0.3, 1.8])
     def test_equal_lag_is_no_contour_error(self, circle, lag):
         report, _ = contour(whole(circle(lag=lag)))
         assert report.peak_um < RADIUS_UM * (1.0 - np.cos(np.pi / 500)) * 1.01
         assert report.along_mean_um == pytest.approx(-lag * RADIUS_UM, rel=1e-3)
         assert report.along_rms_um == pytest.approx(abs(lag) * RADIUS_UM, rel=1e-3)
         assert report.lag_s == pytest.approx(lag / (2.0 * np.pi * 20.0), rel=1e-3)
-        assert report.segments[0].window_s == pytest.approx(0.0125, rel=1e-2)
 
-    def test_lag_beyond_the_window_is_counted(self, circle):
+    def test_lag_beyond_the_reach_is_counted(self, circle, monkeypatch):
+        monkeypatch.setattr(module, "MOST_REACH", 125)
         report, _ = contour(whole(circle(lag=1.8)))
         assert (report.limited_samples, report.samples) == (2000, 2000)
-        assert report.peak_um > 1.0
+        assert report.peak_um == pytest.approx(2.0 * RADIUS_UM * np.sin(0.9 - np.pi / 4), rel=1e-2)
 
     def test_phase_error_between_axes_makes_an_ellipse(self, axis):
         """Of a small phase error p, the half axes are R sqrt(1 +- sin p)."""
@@ -118,6 +118,7 @@ class TestCircle:
         runs = circle(lag=0.2, growth_um=0.1)
         expected, (trace,) = contour(whole(runs))
         monkeypatch.setattr(module, "_TOGETHER", 100)
+        monkeypatch.setattr(module, "MOST_REACH", 100)
         cut = {
             name: in_pieces(run, size)
             for (name, run), size in zip(runs.items(), sizes, strict=True)
@@ -127,7 +128,7 @@ class TestCircle:
         assert found.rms_um == pytest.approx(expected.rms_um, rel=1e-12)
         assert found.along_mean_um == pytest.approx(expected.along_mean_um, rel=1e-9)
         assert (found.samples, found.skew_us) == (expected.samples, expected.skew_us)
-        assert last.t_s.size == trace.t_s.size == 501
+        assert last.index.size == trace.index.size == 501
         np.testing.assert_allclose(last.nearest_um, trace.nearest_um, rtol=0.0, atol=1e-9)
         np.testing.assert_allclose(last.error_um, trace.error_um, rtol=0.0, atol=1e-9)
 
@@ -162,8 +163,8 @@ def test_corner_is_cut(axis):
     measured = np.column_stack([np.convolve(each, lag)[:2000] for each in (x, y)])
     report, (trace,) = check(axis, np.column_stack([x, y]), measured)
     corner = int(np.argmax(trace.error_um))
-    assert 0.1 <= trace.t_s[corner] < 0.11
-    assert trace.error_um[trace.t_s < 0.1].max() < 1e-9
+    assert 1000 <= trace.index[corner] < 1100
+    assert trace.error_um[trace.index < 1000].max() < 1e-9
     assert 0.2 < report.peak_um < 1.0
     assert report.lag_s == pytest.approx(49.5 / RATE_HZ, rel=0.15)
 
@@ -179,7 +180,7 @@ def test_crossing_of_a_lissajous_figure(axis):
     report, (trace,) = check(axis, path, measured, (period / 3, period / 4))
     assert report.mean_um == pytest.approx(0.2, rel=1e-2)
     assert report.peak_um == pytest.approx(0.2, rel=1e-2)
-    assert trace.t_s.size == period + 1
+    assert trace.index.size == period + 1
     crossing = [
         np.linalg.norm(path[:period] - point, axis=1).min() < 0.05 for point in trace.measured_um
     ]
@@ -188,14 +189,24 @@ def test_crossing_of_a_lissajous_figure(axis):
 
 
 def test_turns_of_a_spiral_are_told_apart(axis):
-    """Without a period, the window is that of the sine with the same deviation and speed."""
+    """A point is 1.5 um outside its own turn and 0.5 um inside the next."""
     t = angle(10_000, 500)
     radius = 2.0 * t / (2.0 * np.pi)  # a turn is 2 um beside the one before
     path = radius[:, None] * np.column_stack([np.cos(t), np.sin(t)])
     outside = (radius + 1.5)[:, None] * np.column_stack([np.cos(t), np.sin(t)])
     report, _ = check(axis, path, outside)
-    assert report.segments[0].window_s == pytest.approx(0.0125, rel=0.05)
     assert report.mean_um == pytest.approx(1.5, rel=0.05)
+
+
+def test_flyback_of_a_raster_is_no_nearer_branch(axis):
+    """Lines of 100 um, a flyback to the next line 1 um above, and y 0.3 um too high."""
+    x = np.tile(np.concatenate([np.arange(0.0, 100.0, 0.2), np.arange(100.0, 0.0, -1.0)]), 5)
+    step = np.concatenate([np.zeros(500), np.linspace(0.0, 1.0, 100)])
+    y = np.concatenate([step + line for line in range(5)])
+    path = np.column_stack([x, y])
+    report, _ = check(axis, path, path + np.array([0.0, 0.3]))
+    assert report.peak_um == pytest.approx(0.3, rel=0.02)
+    assert report.along_peak_um < 1.5
 
 
 def test_rejected_and_missing_samples_are_left_out(circle):

@@ -15,13 +15,11 @@ from tests.unit.lab.run_report.test_run_page import NASTY, Page
 def trace(error_um, size=200):
     phase = 2.0 * np.pi * np.arange(size) / size
     circle = np.column_stack([np.cos(phase), np.sin(phase)])
+    along = np.zeros(size)
     return ContourTrace(
-        np.arange(size) / 1000.0,
-        30.0 * circle,
-        (30.0 + error_um) * circle,
-        30.0 * circle,
-        0.0 * phase,
-    )
+        np.arange(size), 30.0 * circle, (30.0 + error_um) * circle, 30.0 * circle,
+        along + error_um, along, along, along,
+    )  # fmt: skip
 
 
 @pytest.mark.parametrize(("error_um", "times"), [
@@ -32,7 +30,7 @@ def test_magnification_is_1_2_or_5_times_a_power_of_ten(error_um, times):
 
 
 def test_path_shows_the_magnified_distance_to_scale():
-    paths, errors = contour_sheets(trace(0.1), ["x", "y"], "circle")
+    paths, errors = contour_sheets(trace(0.1), ["x", "y"], "circle", 1000.0)
     (axes,) = drawn(paths).axes
     assert axes.get_aspect() == 1.0
     reference, measured, _ = (np.hypot(*line.get_data()) for line in axes.get_lines())
@@ -64,7 +62,7 @@ def test_page_has_the_contour_and_each_axis(make_recording, parts):
     assert all(each.startswith("#") for each in page.references)
     assert page.text.count("Axis ") == 2
     assert "100 nm peak" in page.text
-    assert ("window ms" in page.text) == (parts > 1)
+    assert ("lag ms" in page.text) == (parts > 1)
 
 
 def test_page_without_evaluated_samples(make_recording):
