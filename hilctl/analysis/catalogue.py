@@ -169,7 +169,7 @@ def read_catalogue(folder: Path) -> list[Entry]:
         with os.scandir(folder):
             pass
     except OSError as error:
-        raise InputError(f"{folder}: can't be listed: {error.strerror}") from None
+        raise InputError(f"{folder}: cannot be listed: {error.strerror}") from None
     return sorted(_scan(folder), key=lambda entry: entry["path"])
 
 
@@ -185,11 +185,11 @@ def _scan(folder: Path) -> Iterator[Entry]:
             try:
                 status = file.stat()
             except OSError as error:
-                yield unreadable(path, 0, 0, f"can't be read: {error.strerror}")
+                yield unreadable(path, 0, 0, f"cannot be read: {error.strerror}")
                 continue
             yield entry_of(file, path, status.st_size, status.st_mtime_ns)
     for each in unlisted:
-        file, problem = Path(each.filename), f"can't be listed: {each.strerror}"
+        file, problem = Path(each.filename), f"cannot be listed: {each.strerror}"
         yield unreadable(f"{_printable_path(file, folder)}/", 0, 0, problem)
 
 

@@ -81,7 +81,7 @@ def read_bytes(path: Path, max_bytes: int) -> bytes:
         raise InputError(no_such_file(path)) from None
     except (OSError, ValueError) as error:
         why = reason(error) if isinstance(error, OSError) else error
-        raise InputError(f"{path}: can't be read: {why}") from None
+        raise InputError(f"{path}: cannot be read: {why}") from None
 
 
 def open_binary(path: Path, buffering: int = -1) -> BinaryIO:
@@ -205,9 +205,9 @@ def _written(path: Path, *, overwrite: bool) -> Iterator[AtomicFile]:
         raise already_there(path, "give another name, or --overwrite") from None
     except FileNotFoundError as error:
         lost = "" if path.parent.is_dir() else f" (there is no folder {path.parent})"
-        raise InputError(f"{path}: can't be written: {error.strerror}{lost}") from None
+        raise InputError(f"{path}: cannot be written: {error.strerror}{lost}") from None
     except OSError as error:
-        raise InputError(f"{path}: can't be written: {reason(error)}") from None
+        raise InputError(f"{path}: cannot be written: {reason(error)}") from None
 
 
 def already_there(path: Path, remedy: str) -> InputError:

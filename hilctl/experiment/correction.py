@@ -178,7 +178,7 @@ def _alike(a: float, b: float) -> bool:
 
 
 def load_correction(path: Path, files: TextFiles | None = None) -> Correction:
-    """Read a correction file; raise InputError if it can't be read or breaks a rule."""
+    """Read a correction file; raise InputError if it cannot be read or breaks a rule."""
     return load_document(path, files).validate(CorrectionFile).correction
 
 

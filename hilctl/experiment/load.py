@@ -89,7 +89,7 @@ def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperimen
     A file name in a setting is relative to the working folder, or else to the experiment's folder.
 
     Raises:
-        InputError: The file can't be read.
+        InputError: The file cannot be read.
         ConfigError: Rules are broken; the error lists every one of them.
     """
     from_here = [named_from(path.parent, setting) for setting in settings]
@@ -104,7 +104,7 @@ def input_files(document: Document, path: Path) -> list[Path]:
 
 
 def inputs_of(path: Path, settings: Sequence[str] = ()) -> list[Path]:
-    """Return the files that a run of an experiment reads; raise InputError if it can't be read."""
+    """Return the files that a run of an experiment reads; raise InputError if it cannot be read."""
     return input_files(
         document_with(path, [named_from(path.parent, each) for each in settings]), path
     )

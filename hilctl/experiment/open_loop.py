@@ -155,7 +155,7 @@ class _ResponseFile(StrictModel):
 
 
 def load_response(path: Path, files: TextFiles | None = None) -> MeasuredResponse:
-    """Read a response file; raise InputError if it can't be read or breaks a rule."""
+    """Read a response file; raise InputError if it cannot be read or breaks a rule."""
     return load_document(path, files).validate(_ResponseFile).response
 
 

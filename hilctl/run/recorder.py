@@ -185,7 +185,7 @@ class Recorder:
         self._failed = self._failed or self._cannot(why)
 
     def _cannot(self, why: str | None) -> str:
-        return f"{self.path}: can't be written: {why}"
+        return f"{self.path}: cannot be written: {why}"
 
     def flush(self) -> bool:
         """Pass all pending data to the kernel; return whether the file contains all of it."""

@@ -191,9 +191,9 @@ def outputs(place):
 @pytest.mark.usefixtures("outputs")
 @pytest.mark.parametrize("overwrite", [(), ("--overwrite",)])
 @pytest.mark.parametrize(("output", "message"), [
-    ("lost/run.mcap", "lost/run.mcap: can't be written: No such file or directory"),
-    ("regular/run.mcap", "regular/run.mcap: can't be written: Not a directory"),
-    ("x" * 300, "can't be written: File name too long"),
+    ("lost/run.mcap", "lost/run.mcap: cannot be written: No such file or directory"),
+    ("regular/run.mcap", "regular/run.mcap: cannot be written: Not a directory"),
+    ("x" * 300, "cannot be written: File name too long"),
     ("runs", "runs: "),
 ])  # fmt: skip
 def test_unwritable_recording(refused, output, message, overwrite):
@@ -255,7 +255,7 @@ def test_recording_to_read(refused, place, words):
 
 
 def test_schema(refused):
-    message = "lost/schema.json: can't be written: No such file or directory"
+    message = "lost/schema.json: cannot be written: No such file or directory"
     refused(message, "schema", "--output", "lost/schema.json")
 
 

@@ -230,7 +230,7 @@ def test_every_limit_can_be_written(modbus):
 
 
 def test_write_only(modbus):
-    """A LJTick-DAC can't be read; everything else can, WAGO's outputs 0x0200 further."""
+    """A LJTick-DAC cannot be read; everything else can, WAGO's outputs 0x0200 further."""
     labjack, wago = modbus["labjack_t7"], modbus["wago_750"]
     assert labjack.outputs["TDAC0"].readback_register is None
     assert labjack.outputs["DAC0"].readback_register is labjack.outputs["DAC0"]

@@ -46,7 +46,7 @@ GONE = 'mkdir gone; cd gone; rmdir ../gone; exec "$@"'
 
 @pytest.mark.parametrize(("experiment", "output", "code", "said"), [
     ("demo.yaml", "/run.mcap", 3, "the working folder has been deleted: change"),
-    ("/demo.yaml", "run.mcap", 2, "run.mcap: can't be written: No such file or directory"),
+    ("/demo.yaml", "run.mcap", 2, "run.mcap: cannot be written: No such file or directory"),
     pytest.param("/demo.yaml", "/run.mcap", 0, "", marks=pytest.mark.long),
 ])  # fmt: skip
 def test_working_folder_that_is_gone_before_the_start(tmp_path, experiment, output, code, said):
@@ -80,7 +80,7 @@ def test_folder_that_is_deleted_while_a_run_starts(tmp_path, device, inside):
         _, err = process.communicate(timeout=240)
     # Which of the two is noticed first depends on timing.
     gone = "hilctl: the working folder has been deleted: change to another one"
-    taken = "run.mcap: can't be written: the file was deleted or renamed"
+    taken = "run.mcap: cannot be written: the file was deleted or renamed"
     (line,) = err.splitlines()
     assert line.endswith(taken) or (inside and line == gone)
     assert process.returncode in {2, 3}

@@ -7,7 +7,7 @@ Check the experiment's limits first. The tests do this to the coil or the piezo:
   jumps.
 - Three times, they ramp from the safe value a tenth of the way to the limit that is further off,
   hold that for a third of a second, and ramp back; once they step back, and twice where the device
-  can't be opened away from its safe value. Each command passes hilctl's own limiter, which is set
+  cannot be opened away from its safe value. Each command passes hilctl's own limiter, which is set
   to this tenth and to the speed of the experiment's ramp to the safe value. The displacement must
   stay within the experiment's stroke.
 - Once, they request commands that are not finite or out of range. The driver must reject them

@@ -305,7 +305,7 @@ def fit_model(request: FitRequest) -> FittedModel:
 
     The linear algebra is many small steps: with more than one BLAS thread on a busy machine they
     take up to 30 times as long, so programs set ``OPENBLAS_NUM_THREADS=1`` before NumPy loads.
-    Raise DataError if the data can't be used as asked, or there are none.
+    Raise DataError if the data cannot be used as asked, or there are none.
     """
     begin, settings = time.perf_counter(), request.settings
     data = FitData(request.records, request.unit)

@@ -54,7 +54,7 @@ def workers(scheduler: str = "none") -> Iterator[MapFunction]:
 
     It is ``none`` for serial, ``threads`` or ``processes`` on this machine, or the address of a
     Dask scheduler, such as ``tcp://host:8786``, whose workers need the same hilctl. Raise
-    InputError if it is unknown, can't be reached, or Dask is not installed.
+    InputError if it is unknown, cannot be reached, or Dask is not installed.
     """
     if scheduler == "none":
         yield map  # serial

@@ -112,7 +112,7 @@ def settings_from(kind: str, texts: Sequence[str]) -> IdentifySettings:
 
 
 def identify_records(request: FitRequest) -> Identification:
-    """Fit a model to records, and evaluate it; raise DataError if they can't be used."""
+    """Fit a model to records, and evaluate it; raise DataError if they cannot be used."""
     records, validate = request.records, request.validate
 
     def found(modes: Sequence[FurtherMode], selection: Selection | None) -> Found:

@@ -85,7 +85,7 @@ class Refinement:
 def refine_records(old: HysteresisModel, request: FitRequest) -> Refinement:
     """Identify a model from whole runs, and compare it with the old one.
 
-    Raise DataError if the runs can't be used, or are in another unit than the model's commands.
+    Raise DataError if the runs cannot be used, or are in another unit than the model's commands.
     """
     if request.unit != old.input_unit:
         raise DataError(

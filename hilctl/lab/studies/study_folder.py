@@ -46,7 +46,7 @@ def locked_folder(
         # Windows has no locks and cannot open a folder.
         held = os.open(folder if HAS_LOCKS else os.devnull, os.O_RDONLY)
     except OSError as error:
-        raise InputError(f"{folder}: can't be created: {error.strerror}") from None
+        raise InputError(f"{folder}: cannot be created: {error.strerror}") from None
     try:
         waited_s = 0.0
         while not _locked(held):
@@ -107,7 +107,7 @@ def repair_recordings(folder: Path) -> list[str]:
             try:
                 done += _put_aside(path)
             except OSError as error:
-                raise InputError(f"{path}: can't be repaired: {reason(error)}") from None
+                raise InputError(f"{path}: cannot be repaired: {reason(error)}") from None
     return done
 
 

@@ -198,7 +198,7 @@ def request_stop(run: RunFolder) -> bool:
     except ProcessLookupError:
         pass
     except OSError as error:
-        raise RunError(f"{run.card.name}: can't be stopped: {error.strerror}") from None
+        raise RunError(f"{run.card.name}: cannot be stopped: {error.strerror}") from None
     if not run.alive:
         return False
     from hilctl.run.processes import signal_guardian  # a stop must not wait for NumPy

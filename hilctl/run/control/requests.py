@@ -104,7 +104,7 @@ class _Server(socketserver.ThreadingUnixStreamServer):
         try:
             super().__init__(str(path), _Handler)
         except OSError as error:
-            raise RunError(f"{path}: can't listen: {error.strerror or error}") from None
+            raise RunError(f"{path}: cannot listen: {error.strerror or error}") from None
 
     def server_bind(self) -> None:
         # Not chmod after bind: for that moment others could connect.

@@ -145,14 +145,14 @@ class TestWriting:
         with pytest.raises(wanted) as caught:
             write_file(path, write, overwrite=overwrite)
         if wanted is InputError:
-            assert str(caught.value).startswith(f"{path}: can't be written: No space left")
+            assert str(caught.value).startswith(f"{path}: cannot be written: No space left")
         left = [each.read_text() for each in tmp_path.iterdir()]
         assert left == (["precious"] if overwrite else [])
 
     def test_failed_sync_leaves_nothing(self, tmp_path, monkeypatch):
         monkeypatch.setattr(os, "fsync", _refuse)
         with pytest.raises(
-            InputError, match=r"out\.txt: can't be written: Operation not permitted"
+            InputError, match=r"out\.txt: cannot be written: Operation not permitted"
         ):
             write_text(tmp_path / "out.txt", "text", overwrite=False)
         assert list(tmp_path.iterdir()) == []
@@ -167,7 +167,7 @@ class TestWriting:
     def test_special_files_are_not_replaced(self, tmp_path):
         os.mkfifo(tmp_path / "pipe")
         for path in (tmp_path, tmp_path / "pipe"):
-            with pytest.raises(InputError, match="can't be written: Not a regular file"):
+            with pytest.raises(InputError, match="cannot be written: Not a regular file"):
                 write_text(path, "text", overwrite=True)
         assert (tmp_path / "pipe").is_fifo()
 
@@ -179,7 +179,7 @@ class TestWriting:
     @pytest.mark.parametrize("overwrite", [True, False])
     def test_unwritable_places_are_refused(self, tmp_path, name, reason, overwrite):
         (tmp_path / "plain").touch()
-        with pytest.raises(InputError, match=f"can't be written: {reason}") as caught:
+        with pytest.raises(InputError, match=f"cannot be written: {reason}") as caught:
             write_text(tmp_path / name, "text", overwrite=overwrite)
         assert str(caught.value).startswith(str(tmp_path / name))
 
@@ -204,7 +204,7 @@ def test_unwritable_output_is_refused_in_advance(tmp_path, name):
     before = sorted(tmp_path.iterdir())
     said = []
     for write in (check_writable, partial(write_text, text="new")):
-        with pytest.raises(InputError, match=f"{name}: can't be written") as refused:
+        with pytest.raises(InputError, match=f"{name}: cannot be written") as refused:
             write(tmp_path / name, overwrite=True)
         said.append(str(refused.value))
     assert said[0] == said[1]

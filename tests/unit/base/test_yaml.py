@@ -329,7 +329,7 @@ def test_files_are_read_or_refused(tmp_path):
     for bad, message in [
         (tmp_path / "none.yaml", "no such file"),
         (tmp_path, "is not a file"),
-        (tmp_path / "a\0b", "can't be read: .*embedded null"),
+        (tmp_path / "a\0b", "cannot be read: .*embedded null"),
     ]:
         with pytest.raises(InputError, match=message):
             load_document(bad)

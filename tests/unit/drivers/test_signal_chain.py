@@ -1,4 +1,4 @@
-"""Watchdogs that can't do what is asked of them, and channels that can't be wired so."""
+"""Watchdogs that cannot do what is asked of them, and channels that cannot be wired so."""
 
 import pytest
 from pydantic import ValidationError

@@ -331,8 +331,8 @@ def history_from_pieces(pieces: Iterable[Recording]) -> History:
         raise DataError(f"{piece.path}: holds no sample of the waveform")
     if lost:
         raise DataError(
-            f"{piece.path}: samples are missing whose command is unknown, so it can't be fitted as "
-            "a whole. Omit --whole to use its steady cycles"
+            f"{piece.path}: samples are missing whose command is unknown, so it cannot be fitted "
+            "as a whole. Omit --whole to use its steady cycles"
         )
     signals = np.concatenate(indices), _joined(command), _joined(displacement_um)
     filled = _filled(piece.path, *signals, np.arange(begins_at, next_sample))

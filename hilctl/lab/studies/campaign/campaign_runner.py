@@ -213,7 +213,7 @@ def planned_in_real_time(campaign: CampaignSteps, folder: Path, now: MachineTime
 def run_series(plan: CampaignPlan, host: StudyHost) -> CampaignResult:
     """Run the remaining steps of a campaign one after the other in real time.
 
-    Raise InputError without disk space, or if the table can't be written; nothing has moved.
+    Raise InputError without disk space, or if the table cannot be written; nothing has moved.
     """
     return run_study(
         Campaign(plan, host).study(), plan.folder, host, total_s=plan.seconds + plan.pauses_s

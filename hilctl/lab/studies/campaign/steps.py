@@ -213,7 +213,7 @@ class CampaignSteps:
 
     @contextmanager
     def base_read(self) -> Iterator[None]:
-        """Raise ConfigError, located in the campaign file, if the base can't be read meanwhile."""
+        """Raise ConfigError, located in the campaign file, if the base cannot be read meanwhile."""
         try:
             yield
         except ConfigError:
@@ -222,7 +222,7 @@ class CampaignSteps:
             raise ConfigError([self.document.problem("experiment", str(error))]) from None
 
     def load(self, step: CampaignStep, files: TextFiles) -> LoadedExperiment:
-        """Return the experiment of a step; raise InputError if it can't be read or is invalid."""
+        """Return the experiment of a step; raise InputError if it cannot be read or is invalid."""
         document = load_document(self.experiment, files)
         return resolve(document, self.experiment.parent, self.settings_for(step, files), files)
 
@@ -245,7 +245,7 @@ class CampaignSteps:
 def load_campaign(path: Path, settings: Sequence[str] = ()) -> CampaignSteps:
     """Read a campaign file, with ``key=value`` texts over its base experiment.
 
-    Raise InputError if it can't be read, ConfigError with all problems if it is invalid.
+    Raise InputError if it cannot be read, ConfigError with all problems if it is invalid.
     """
     return campaign_of(load_document(path), path.parent, settings)
 

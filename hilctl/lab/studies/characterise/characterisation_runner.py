@@ -156,7 +156,7 @@ class CharacterisationRunner:
         """Run all steps, then identify and validate the model and write it to ``output``.
 
         Raises:
-            InputError: A file can't be written, no disk space, or the folder has recordings with
+            InputError: A file cannot be written, no disk space, or the folder has recordings with
                 other settings; nothing has moved.
             StepStoppedError: The user stopped a step.
             RunError: A step ended by a fault that is no known problem of the rig.

@@ -135,7 +135,7 @@ class RunSeries:
     Attributes:
         name: Name of the campaign, or of the runs.
         keys: Varied keys.
-        missing: Errors of recordings that can't be read.
+        missing: Errors of recordings that cannot be read.
     """
 
     name: str
@@ -213,7 +213,7 @@ def collect(
 
     Raises:
         InputError: A folder contains no recordings, or is not the only path.
-        DataError: A named recording, or the table, can't be read.
+        DataError: A named recording, or the table, cannot be read.
     """
     folders = [path for path in paths if is_folder(path)]
     if folders and len(paths) > 1:
@@ -230,7 +230,7 @@ def collect(
 
 
 def series_of(name: str, runs: Sequence[SeriesRun], missing: Sequence[str] = ()) -> RunSeries:
-    """Return the runs of a campaign, and the errors of recordings that can't be read."""
+    """Return the runs of a campaign, and the errors of recordings that cannot be read."""
     keys = tuple(dict.fromkeys(key for run in runs for key in run.values))
     return RunSeries(name, tuple(runs), keys, tuple(missing), is_campaign=True)
 
@@ -265,7 +265,7 @@ def _of_files(
     on_read: OnRead,
     missing: list[str] | None,
 ) -> RunSeries:
-    """Read files; add the errors of those that can't be read to ``missing``, if it is a list."""
+    """Read files; add the errors of those that cannot be read to ``missing``, if it is a list."""
     digests = []
     for number, path in enumerate(paths):
         on_read(number / len(paths), f"read {path.name}")

@@ -502,7 +502,7 @@ def test_late_replies_are_not_taken_for_the_next(case):
 
 @BOTH
 def test_single_write_must_echo_this_value(wire):
-    """On RTU an echo of the value before can't be told by an id, but by the value."""
+    """On RTU an echo of the value before cannot be told by an id, but by the value."""
     made = Prepared("single", wire)
     assert made.answered(lambda request: made.wrap(request, H("06 0007") + b"cd"), b"cd") == b""
     for other in (b"ab", OLD[:2]):
@@ -563,7 +563,7 @@ def test_an_echo_as_long_as_the_reply_is_named():
     ["0001 0000 F000 01 03 02", "0001 0000 0000 01 03 02", "0001 0100 0090 01 03 02"],
 )
 def test_nonsense_is_not_waited_for(nonsense):
-    """A header that can't be Modbus is refused at once, not after its claimed 60 kB."""
+    """A header that cannot be Modbus is refused at once, not after its claimed 60 kB."""
     link = AnsweringLink(lambda _: H(nonsense))
     with pytest.raises(links.CorruptError):
         session_on(link, "tcp", unit=1).prepare(read_pdu(3, 0, 1))()

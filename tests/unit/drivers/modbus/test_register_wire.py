@@ -152,7 +152,7 @@ class TestExchange:
             device.open(501.0, 1)
 
     def test_output_that_can_not_be_read_is_not_tried(self, serve):
-        """A TDAC can't be read back, so trying function 76 on it would move it."""
+        """A TDAC cannot be read back, so trying function 76 on it would move it."""
         served = serve("labjack_t7", output="TDAC0")
         device = served.running(333.0)
         assert device.info.max_rate_hz == pytest.approx(1e3 / 3)  # 1 ms each and 1 ms to settle

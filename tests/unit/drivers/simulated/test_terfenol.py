@@ -149,7 +149,7 @@ def test_noise_is_the_sensors():
 
 class TestTiming:
     def test_reading_comes_before_the_command(self):
-        """The first reading can't show the first command, neither as current nor as motion."""
+        """The first reading cannot show the first command, neither as current nor as motion."""
         displacement_um, current_a = np.empty(50), np.empty(50)
         terfenol.TerfenolActuator(QUIET, RATE_HZ).step(np.full(50, 2.0), displacement_um, current_a)
         assert displacement_um[0] == 0.0

@@ -155,7 +155,7 @@ def test_a_port_that_cannot_be_opened_ends_the_attempt():
     line = LineOfText(is_open=False)
 
     def refuse(*, boot):
-        raise LostError("can't be opened")
+        raise LostError("cannot be opened")
 
     line.open = refuse
     with pytest.raises(LostError):

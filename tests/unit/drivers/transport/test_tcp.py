@@ -135,7 +135,7 @@ def test_tcp_unknown_host_is_one_line():
 
 
 def test_tcp_frame_error_closes_the_connection(serve):
-    """When the reply can't be one, what else is on its way must not be taken for the next."""
+    """When the reply cannot be one, what else is on its way must not be taken for the next."""
 
     def act(connection):
         connection.recv(100)

@@ -1,4 +1,4 @@
-"""What is wrong with data is said; what can't be known from them is not promised."""
+"""What is wrong with data is said; what cannot be known from them is not promised."""
 
 from dataclasses import replace
 

@@ -121,7 +121,7 @@ def test_a_mode_is_found_beside_a_gain(gain):
     ((HIGH, LOW.model_copy(update={"natural_hz": 1000.0})), RATE_HZ, False),  # one, cut in two
     ((LOW.model_copy(update={"natural_hz": 2200.0}),), RATE_HZ, False),  # the first one
     ((LOW.model_copy(update={"antiresonance_hz": 2500.0}),), RATE_HZ, False),
-    ((LOW.model_copy(update={"antiresonance_hz": 100.0}),), 1000.0, False),  # can't be undone
+    ((LOW.model_copy(update={"antiresonance_hz": 100.0}),), 1000.0, False),  # cannot be undone
     ((LOW.model_copy(update={"antiresonance_damping_ratio": 0.2999}),), RATE_HZ, False),
 ])  # fmt: skip
 def test_modes_stand_where_they_are_apart_and_can_be_undone(modes, rate_hz, stands):

@@ -94,7 +94,7 @@ def test_all_runs_are_stopped_before_waiting_for_one(answers, monkeypatch):
     def request(each):
         done.append(each.card.name)
         if each.card.name == "c":
-            raise RunError("c: can't be stopped: no right")
+            raise RunError("c: cannot be stopped: no right")
         return each.card.name != "b"
 
     def sleep(seconds):
@@ -109,7 +109,7 @@ def test_all_runs_are_stopped_before_waiting_for_one(answers, monkeypatch):
     assert [(each["name"], each["ended"], each["error"]) for each in stopped] == [
         ("a", True, ""),
         ("b", False, "its supervisor is gone"),
-        ("c", False, "c: can't be stopped: no right"),
+        ("c", False, "c: cannot be stopped: no right"),
         ("d", True, ""),
     ]
     assert answers == []

@@ -529,7 +529,7 @@ def test_an_error_of_one_request_ends_no_other(server, tmp_path, caplog):
 def test_clients_without_a_thread_take_no_place(server, tmp_path, monkeypatch, caplog):
     with monkeypatch.context() as patch:
         patch.setattr(
-            threading.Thread, "start", Mock(side_effect=RuntimeError("can't start new thread"))
+            threading.Thread, "start", Mock(side_effect=RuntimeError("cannot start new thread"))
         )
         for _ in range(70):
             with connect(tmp_path) as client:
@@ -555,7 +555,7 @@ def test_ask_returns_the_answer_or_raises(tmp_path):
 
 
 def test_a_path_that_cannot_be_used_is_an_error(tmp_path):
-    with pytest.raises(RunError, match="can't listen"):
+    with pytest.raises(RunError, match="cannot listen"):
         ControlServer(tmp_path / ("x" * 200), echo)
     assert list(tmp_path.iterdir()) == []
 

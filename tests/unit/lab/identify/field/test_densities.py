@@ -128,7 +128,7 @@ def test_where_a_sensor_has_its_zero_makes_no_difference(shift_um):
 
 
 def test_a_row_counts_by_the_square_of_its_scale():
-    """Two rows of weight 1 are one of twice the weight; rows of no weight can't pull."""
+    """Two rows of weight 1 are one of twice the weight; rows of no weight cannot pull."""
     y, given = displacement_um(columns()), columns()
     y[::2] += 0.5
     scale = np.where(np.arange(y.size) % 2, 1.0, 1e-9)
