@@ -3,5 +3,5 @@
 ``hilctl`` never imports this package; its registry loads a device by name. Modules here import only
 ``hilctl.base`` and ``hilctl.kernels``.
 
-A protocol folder holds profiles, messages, a session with a device, and the wire to its output.
+A protocol folder has the profiles, messages, session with a device, and wire to its output.
 """

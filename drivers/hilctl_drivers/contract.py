@@ -1,7 +1,7 @@
-"""The device contract as pytest checks, for the devices of any package.
+"""The device contract as pytest tests, for devices of any package.
 
-They send commands up to both ends of the device's range: only for a device that is simulated, or
-wired to an emulator. In a test file of the package::
+The tests send commands up to both ends of the device's range, so use them only with a simulated
+device or an emulator. In a test file of the package::
 
     import pytest
     from hilctl_drivers.contract import *
@@ -33,8 +33,8 @@ STEP = 0.01
 class DrivenDevice:
     """A device and how to use it.
 
-    ``stands`` returns its output as a command, if possible that of the emulated device or the
-    simulated plant; None if it is not known.
+    ``stands`` returns its output as a command, if possible from the emulated device or the
+    simulated plant; None if unknown.
     """
 
     device: Device  # not yet open
@@ -67,19 +67,19 @@ class DrivenDevice:
         return displacement_um, measured
 
     def assert_stands(self, command: float) -> None:
-        """Fail unless the output is at a command, where anything can tell."""
+        """Fail unless the output is at a command, if the output is known."""
         stands = self.stands()
         assert stands is None or stands == pytest.approx(command, abs=STEP)
 
     @property
     def middle(self) -> float:
-        """A command well inside the range that is not the resting one."""
+        """A command well inside the range and different from the resting one."""
         info = self.device.info
         return 0.5 * (info.command_max + max(0.0, info.command_min))
 
 
 def driven_device(device: Device) -> DrivenDevice:
-    """Return a device to check, whose output is what it says itself."""
+    """Return a device to check; its output is the one that it reports."""
     rate_hz = min(RATE_HZ, device.info.max_rate_hz)
 
     def stands() -> float | None:
@@ -96,7 +96,7 @@ def driven_device(device: Device) -> DrivenDevice:
 
 @pytest.fixture
 def new_device() -> Callable[[], Device]:
-    """Return what makes the device under test, not yet open; each test file has its own."""
+    """Return a factory of the device under test, not yet open; each test file defines its own."""
     raise NotImplementedError("define a fixture new_device that returns a function")
 
 
@@ -127,7 +127,7 @@ def driven(make: Callable[[str], DrivenDevice], case: str) -> DrivenDevice:
 
 
 def test_says_what_it_is_before_it_is_opened(driven: DrivenDevice) -> None:
-    """Info is complete and sensible without a connection."""
+    """Info is complete and plausible without a connection."""
     info = driven.device.info
     assert info.name
     assert not driven.name or info.name == driven.name
@@ -147,7 +147,7 @@ def test_exchanges_blocks(driven: DrivenDevice) -> None:
     rest, _ = driven.exchange(np.zeros(SAMPLES))
     driven.exchange(np.linspace(0.0, driven.middle, SAMPLES))
     moved, measured = driven.exchange(np.full(SAMPLES, driven.middle))
-    for values in (rest, moved):  # none of which holds of what is not a number
+    for values in (rest, moved):  # false for NaN
         assert (values >= info.sensor_min_um).all()
         assert (values <= info.sensor_max_um).all()
     assert moved.max() > rest.max() + 1.0
@@ -165,7 +165,7 @@ def test_displacement_is_sampled_before_the_command_acts(driven: DrivenDevice) -
 
 @pytest.mark.parametrize("bad", [np.nan, np.inf, -np.inf, "above", "below"])
 def test_refuses_what_it_can_not_do(driven: DrivenDevice, bad: float | str) -> None:
-    """A value that is not finite or out of range is refused whole: nothing of the block is sent."""
+    """A block with a value that is not finite or out of range is refused; nothing is sent."""
     driven.open()
     info = driven.device.info
     beyond = 0.001 * (info.command_max - info.command_min)
@@ -208,7 +208,7 @@ def test_use_before_open_and_after_close_is_refused(driven: DrivenDevice) -> Non
 
 
 def test_opening_does_not_move_the_output(driven: DrivenDevice) -> None:
-    """What was output before stays through closing and opening; simulated ones start at rest."""
+    """The output stays through closing and opening; simulated devices start at rest."""
     driven.open()
     driven.exchange(np.full(SAMPLES, driven.middle))
     held, _ = driven.exchange(np.full(SAMPLES, driven.middle))
@@ -226,7 +226,7 @@ def test_rate_beyond_its_limit_is_refused(driven: DrivenDevice) -> None:
 
 
 def test_make_safe_works_open_or_closed(driven: DrivenDevice) -> None:
-    """The last resort needs no open connection; what stands at the output then is the judge."""
+    """The safe value needs no open connection; the output afterwards decides."""
     safe = 0.5 * driven.middle
     driven.device.make_safe(safe)
     driven.assert_stands(safe)
@@ -271,7 +271,7 @@ def test_arming_moves_nothing_and_needs_an_open_device(driven: DrivenDevice) -> 
 
 
 def test_says_what_it_puts_out(driven: DrivenDevice) -> None:
-    """After opening it knows what stands there, or says that it does not."""
+    """After opening, a device reports its output, or that the output is unknown."""
     with pytest.raises(DeviceError):
         driven.device.output()
     driven.open()
@@ -287,7 +287,7 @@ def test_says_what_it_puts_out(driven: DrivenDevice) -> None:
 def test_two_of_a_kind_agree(
     driven: DrivenDevice, make: Callable[[str], DrivenDevice], case: str
 ) -> None:
-    """A second one with the same options gives the same bits: runs can be repeated."""
+    """A second device with the same options gives the same bits, so runs are reproducible."""
     other = make(case)
     command = np.linspace(0.0, driven.middle, SAMPLES)
     driven.open()

@@ -31,7 +31,7 @@ _PROMPT_S = 0.2
 class Dac(DacDevice):
     """A :class:`~hilctl.base.device.Device` with a profile.
 
-    It is made of a wire to the output and its watchdog (:mod:`hilctl_drivers.wire`), the scale of
+    It consists of a wire to the output and its watchdog (:mod:`hilctl_drivers.wire`), the scale of
     amplifier and sensor (:class:`~hilctl_drivers.signal_chain.SignalChain`), and readers of the
     sensor, of the output, and of auxiliary channels.
 
@@ -49,7 +49,7 @@ class Dac(DacDevice):
         named = options.profile
         if (path := named.profile.WIRES.get(self.KIND)) is None:
             kind = named.profile.DEVICE
-            raise InputError(f"profile {named.name} is one for kind: {kind}, not {self.KIND}")
+            raise InputError(f"profile {named.name} is for kind: {kind}, not {self.KIND}")
         self._options = options
         self._setup = setup = DacSetup.of(options)
         self._chain = setup.chain
@@ -140,7 +140,7 @@ class Dac(DacDevice):
         if message_s <= _PROMPT_S:
             return ""
         timeout_s = self._options.watchdog_timeout_s
-        behind = "no watchdog of the device stands behind it"
+        behind = "the device has no watchdog"
         if timeout_s is not None:
             behind = f"the device's watchdog acts after {timeout_s:g} s"
         return f"a message takes up to {message_s:.2g} s on this line; {behind}"
@@ -170,10 +170,10 @@ class Dac(DacDevice):
         return self._wire.rates(block)
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
-        """Connect, end what an earlier run has left, init steps, one reading, test of the output.
+        """Connect, clean up after an earlier run, run the init steps, read once, test the output.
 
-        The order matters: a device that has tripped refuses steps, and a wrong input must show
-        before the output can move.
+        The order matters: a tripped device refuses steps, and a wrong input must be detected before
+        the output can move.
         """
         wire = self._wire
         self._plan_feeding(sample_rate_hz / block)
@@ -188,14 +188,14 @@ class Dac(DacDevice):
             self._aux_readers = self._setup.aux_readers(wire.link, self._reader.link)
 
     def _plan_feeding(self, ticks_per_s: float) -> None:
-        """Take the rate of exchanges, or raise DeviceError if it is too low for the watchdog."""
+        """Plan the feeding; raise DeviceError if the exchange rate is too low for the watchdog."""
         has = self._setup.writer.profile.watchdog
         ticks = check_feeds(self._options.watchdog_timeout_s, ticks_per_s)
         self._feed_every = ticks if has != "none" and has.kick == "strict" else 0
         self._ticks = 0
 
     def _connect(self, block_s: float = 0.0) -> None:
-        """Connect, check that the devices are the right ones, and note errors of before."""
+        """Connect, verify the identity of the devices, and note earlier errors."""
         if errors := self._wire.open(block_s):
             details = {**self._info.details, "earlier_errors": "; ".join(errors)}
             self._info = replace(self._info, details=details)
@@ -245,19 +245,19 @@ class Dac(DacDevice):
     def _abandon(self) -> None:
         """Keep a serial port: opening it again could reset a board before its output is safe.
 
-        The reader is kept too: the safe value must not wait until its port is closed.
+        The reader is kept too, because the safe value must not wait until its port is closed.
         """
         self._wire.link.doubt()
 
     def _put_out(self, command: float) -> None:
-        # No self-test, no init steps, no reader: none of them may cost the safe value.
+        # No self-test, no init steps, no reader: none of them may prevent the safe value.
         value, wire, link = self._chain.output(command), self._wire, self._wire.link
         if isinstance(link, StreamLink):
             self._safe_exchange.attempt(
                 link, lambda: link.send_now(wire.message(value)), lambda: wire.confirm(value)
             )
         else:
-            link.open()  # a new connection: no answer to an older command can come on it
+            link.open()  # a new connection has no answers to older commands
             wire.confirm(value)
 
     def _close(self) -> None:

@@ -24,7 +24,7 @@ from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 
 @dataclass(frozen=True, slots=True)
 class AuxSource:
-    """An auxiliary channel, the device that has its input, and the options."""
+    """An auxiliary channel, the device with its input, and the options."""
 
     channel: AuxChannel
     holder: Endpoint
@@ -105,7 +105,7 @@ class DacSetup:
         return session_class(self.reader).read_time(self.reader.profile, self.input)
 
     def reader_on(self, link: Link) -> SensorReader:
-        """Return what reads the sensor; it uses the output's link if it shares it."""
+        """Return the reader of the sensor; it uses the output's link if it shares it."""
         own = self.reads_elsewhere and not self.shares_link
         return SensorReader(self.reader, self.input, link, self.reader_name, own=own)
 
@@ -143,7 +143,7 @@ class DacSetup:
             raise InputError(f"timeout_s must be > {wire.answered_s:g}, got {timeout_s:g} ({wire})")
 
     def after_reading(self, wire: WireTime) -> WireTime:
-        """Return the time of a sample that ``wire`` writes, and that the reader reads before.
+        """Return the time of a sample that the reader reads and then ``wire`` writes.
 
         It includes the slowest auxiliary channel, and setting the digital output.
         """

@@ -80,7 +80,7 @@ class DacDevice(ABC):
         self._rates(block).check(sample_rate_hz)
 
     def open(self, sample_rate_hz: float, block: int) -> None:
-        """Connect, check that the device is what it should be, and set it up; nothing moves.
+        """Connect, check the identity of the device, and set it up; nothing moves.
 
         Raises:
             DeviceError: It is unreachable, is another device, refuses a step, or does not support
@@ -151,8 +151,8 @@ class DacDevice(ABC):
     ) -> None:
         """Send one block of commands, see :meth:`hilctl.base.device.Device.exchange`.
 
-        Nothing is sent of a block of another size than agreed at open, or with a command that is
-        out of range or not finite.
+        A block is rejected before anything is sent if its size differs from the one at open, or a
+        command is out of range or not finite.
         """
         block = self._block
         if not command.size == displacement_um.size == measured.size == block or not block:
@@ -221,7 +221,7 @@ class DacDevice(ABC):
     def close(self) -> None:
         """Disarm and disconnect; the output stays. Closing twice is allowed.
 
-        After an error in an exchange there is no connection any more, and a watchdog stays armed.
+        After an error in an exchange the connection is already closed, and a watchdog stays armed.
         """
         opened, self._block = self._block != 0, 0
         try:
@@ -239,7 +239,7 @@ class DacDevice(ABC):
         self._next_aux = (k + 1) % len(self._aux_readers)
 
     def _reset_digital(self, command: float) -> None:
-        """Set the digital output low after the safe command; once, since the outcome waits."""
+        """Set the digital output low after the safe command, once, because the outcome waits."""
         if command == self.safe_command and not self._digital_is_low:
             self._digital_is_low = True
             with suppress(DeviceError):
@@ -259,24 +259,24 @@ class DacDevice(ABC):
 
     @abstractmethod
     def _open(self, sample_rate_hz: float, block: int) -> None:
-        """Connect and set up; block and rate are good. :meth:`_release` follows an error."""
+        """Connect and set up; block and rate are valid. :meth:`_release` follows an error."""
 
     def _arm(self) -> None:  # noqa: B027  simulated devices have no watchdog
         """Arm the watchdog, if the experiment wants it. :meth:`_abandon` follows an error."""
 
     def _output(self) -> float | None:
-        """Return the output of a device that is open; None if it cannot be known."""
+        """Return the output of an open device; None if unknown."""
         return None
 
     def _look(self) -> DeviceReadings:
         """Connect, and return the readings without their correction; :meth:`_release` follows."""
-        raise DeviceError("it cannot be read without being set up")
+        raise DeviceError("it cannot be read without a setup")
 
     @abstractmethod
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
-        """Exchange a block whose sizes and range are good. :meth:`_abandon` follows an error."""
+        """Exchange a block of valid size and range. :meth:`_abandon` follows an error."""
 
     def _abandon(self) -> None:
         """Give up a connection on which arming or an exchange has failed."""
@@ -302,7 +302,7 @@ class DacDevice(ABC):
             raise DeviceError(f"block must be {span}{self.block_note}, got {block}")
 
     def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
-        """Raise DeviceError for a block that is not as agreed at open."""
+        """Raise DeviceError for a block whose size differs from the one at open."""
         if not self._block:
             raise self._error(self._action, "not open")
         sizes = ", ".join(str(each.size) for each in (command, displacement_um, measured))
@@ -314,7 +314,7 @@ class DacDevice(ABC):
         return DeviceError(f"{self._title}: {what} (to {action})")
 
     def _failed(self, action: str, error: DeviceError, give_up: Callable[[], None]) -> DeviceError:
-        """Give the connection up and return the error with device and action."""
+        """Abandon the connection and return the error with device and action."""
         self._block = 0
         give_up()
         return self._error(action, str(error))

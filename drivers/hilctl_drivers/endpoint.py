@@ -1,4 +1,4 @@
-"""Addresses of devices, resolved against their profiles: that of the output, and of the reader."""
+"""Addresses of the devices with the output and the sensor, resolved against their profiles."""
 
 from dataclasses import dataclass, replace
 
@@ -58,7 +58,7 @@ class Endpoint:
 
     @property
     def holds(self) -> tuple[str, ...]:
-        """Names of its place, for :attr:`hilctl.base.device.DeviceInfo.holds`."""
+        """Names of its address, for :attr:`hilctl.base.device.DeviceInfo.holds`."""
         if self.host:
             return held_address(self.host, int(self.port))
         return held_port(str(self.port))
@@ -134,7 +134,7 @@ def _on_the_line_of(writer: Endpoint, reader: Endpoint) -> Endpoint:
         both = "neither has an address" if reader.unit is None else f"both are unit {reader.unit}"
         raise InputError(f"{rule}: {both}; give reader.unit_id, or {remedy}")
     if isinstance(mine, SerialLineSettings) and isinstance(line, SerialLineSettings):
-        if reader.framing != "tcp":  # behind a gateway the line is the gateway's business
+        if reader.framing != "tcp":  # behind a gateway, the gateway determines the line settings
             check_baud(profile, line.baud)
         shared = {name: getattr(line, name) for name in LINE}
         profile = profile.model_copy(update={"link": mine.model_copy(update=shared)})

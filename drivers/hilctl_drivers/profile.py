@@ -36,7 +36,7 @@ _Profile = TypeVar("_Profile", bound=BaseProfile)
 
 @dataclass(frozen=True, slots=True)
 class NamedProfile:
-    """A profile, its text, and its name in the experiment: that of a shipped one, or a path."""
+    """A profile, its text, and its name in the experiment (a shipped profile, or a path)."""
 
     name: str
     profile: BaseProfile
@@ -54,7 +54,7 @@ def shipped_profiles() -> dict[str, Path]:
 
 
 def load_profile(name_or_path: str) -> BaseProfile:
-    """Return a profile by the name of a shipped one, or by path: with a slash or suffix of YAML.
+    """Return a shipped profile by name, or another one by path (with a slash or a YAML suffix).
 
     Raises:
         InputError: There is no such profile, or the file cannot be read.
@@ -118,7 +118,7 @@ def parse_profile(text: str, where: str) -> BaseProfile:
 
 
 def _has_keys(document: Document, kind: str) -> bool:
-    """Return whether a file has at the top the keys of profiles of a kind."""
+    """Return whether a file has top-level keys of profiles of a kind."""
     fields, keys = profile_class(kind).model_fields, document.data.keys()
     return fields.keys() >= keys >= {name for name, each in fields.items() if each.is_required()}
 

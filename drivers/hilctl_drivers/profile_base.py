@@ -13,7 +13,7 @@ from hilctl_drivers.transport.wire_time import WireTime
 
 
 class LinkSettings(StrictModel):
-    """Settings of every link; ``kind`` selects the protocol. These are those of TCP."""
+    """Settings of every link, here of TCP; ``kind`` selects the protocol."""
 
     COMMON: ClassVar[tuple[str, ...]] = ()
     """Keys that must be the same for all devices on a line."""
@@ -233,7 +233,7 @@ class SteppedWatchdog(Watchdog, Generic[Step]):
     def arming(self, output: str) -> tuple[Step, ...]:
         """Return all steps that arm it, with the safe value of an output first.
 
-        Once the timeout counts, the watchdog must know where to go.
+        The watchdog needs its safe value before the timeout starts.
         """
         return (*self.safe.get(output, ()), *self.arm)
 
@@ -290,7 +290,7 @@ class BaseProfile(StrictModel):
     unverified: tuple[Text, ...] = Field(
         default=(), description="dotted keys of this file that no document confirms"
     )
-    notes: tuple[Text, ...] = Field(default=(), description="what to know before wiring")
+    notes: tuple[Text, ...] = Field(default=(), description="notes on the wiring")
     turnaround_s: float = Field(
         ge=0.0,
         le=1.0,
@@ -330,7 +330,7 @@ class BaseProfile(StrictModel):
     def framings(self) -> tuple[Literal["tcp", "rtu"], ...]:
         """Frames of Modbus that it may use on TCP, the usual first; empty for other protocols.
 
-        On a serial line it uses the last.
+        A serial line uses the last one.
         """
         return ()
 

@@ -1,7 +1,7 @@
 """Sessions with devices, and the reader of the sensor.
 
-The sensor is read by the device with the output or by another one, of any protocol. That one has a
-link of its own, or shares the line or connection of the output.
+The device with the output reads the sensor, or another device of any protocol, which has its own
+link or shares the line or connection of the output.
 """
 
 import math
@@ -23,7 +23,7 @@ class Session(ABC):
     AGES: ClassVar[bool] = False
     """Whether the device sends unasked, so that its readings have an age."""
     READS_ANY: ClassVar[bool] = True
-    """Whether it can read any input of the device in a request of its own."""
+    """Whether it can read any input of the device in a separate request."""
     age_s = math.nan
     """Age of the last reading, if it has one."""
     lost = 0
@@ -50,11 +50,11 @@ class Session(ABC):
         """Raise DeviceError if it is another device."""
 
     def old_errors(self) -> list[str]:
-        """Take the errors of earlier sessions out of the device, and return them."""
+        """Read and clear the errors of earlier sessions."""
         return []
 
     def check_errors(self) -> None:  # noqa: B027  most devices answer each command
-        """Raise RefusedError for an error that commands without a reply have left."""
+        """Raise RefusedError for an error of earlier commands without a reply."""
 
     def set_up(self) -> None:  # noqa: B027  not all profiles have steps
         """Run the init steps."""
@@ -129,9 +129,9 @@ def session_class(device: Endpoint) -> type[Session]:
 
 
 class SensorReader:
-    """Reads an input of the device that has it.
+    """Reader of an input.
 
-    If that is another device than the output's, its errors name it, and it is connected, set up and
+    A device other than the one with the output is named in errors, and connected, set up and
     finished here.
 
     Args:

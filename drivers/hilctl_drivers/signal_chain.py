@@ -57,7 +57,7 @@ class Amplifier(StrictModel):
 
     @property
     def command_unit(self) -> CommandUnit:
-        """Unit of what drives the actuator."""
+        """Unit of the command to the actuator."""
         return "A" if self._given[0].startswith("gain_a") else "V"
 
     @property
@@ -267,7 +267,7 @@ Measure: TypeAlias = Annotated[
 
 
 class AuxInput(DeviceOptions):
-    """Input of an auxiliary channel, whose value is ``scale`` * reading + ``offset``."""
+    """Input of an auxiliary channel with the value ``scale`` * reading + ``offset``."""
 
     input: str = Field(
         description="input of the device that reads the sensor, otherwise of that with the output"
@@ -485,7 +485,7 @@ def check_watchdog(
     chain: SignalChain,
     has: Watchdog | Literal["none"],
 ) -> None:
-    """Reject options of a watchdog that differs from the one that the device ``has``.
+    """Reject watchdog options that do not match the watchdog that the device ``has``.
 
     Raises:
         InputError: It has none, cannot take the timeout, or would not go to the safe command.
@@ -496,7 +496,7 @@ def check_watchdog(
     if has == "none":
         raise InputError(
             f"{title} has no host watchdog: it holds its last output when this "
-            "machine dies; say watchdog: none if you accept that"
+            "machine fails; set watchdog: none to accept that"
         )
     has.counts(wanted.timeout_s)
     low, high = chain.command_range
@@ -514,17 +514,17 @@ def _check_trip(
     safe = getattr(has, "safe", {})
     if has.on_trip == "hold":
         raise InputError(
-            f"the watchdog of {title} holds {name} where it is when it trips: say watchdog: none "
-            "if you accept that"
+            f"the watchdog of {title} holds the value of {name} when it trips: set watchdog: none "
+            "to accept that"
         )
     if has.on_trip == "safe" and safe and name not in safe:
         raise InputError(
-            f"the watchdog of {title} does nothing for {name}, only for "
-            f"{', '.join(safe)}: take one of these, or say watchdog: none"
+            f"the watchdog of {title} does not act on {name}, only on "
+            f"{', '.join(safe)}: use one of these, or set watchdog: none"
         )
     at_zero, unit = chain.command(0.0), chain.command_unit
     if has.on_trip in {"zero", "reset"} and abs(at_zero - safe_command) > 1e-9:
         raise InputError(
-            f"the watchdog of {title} puts {name} at 0 {output.unit}, which is {at_zero:g} "
-            f"{unit} here: set watchdog.safe_command to {at_zero:g}, got {safe_command:g}"
+            f"the watchdog of {title} sets {name} to 0 {output.unit}, which is {at_zero:g} "
+            f"{unit} here: watchdog.safe_command must be that, got {wanted.safe_command:g}"
         )

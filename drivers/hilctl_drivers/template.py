@@ -58,13 +58,13 @@ def starting_section(
     channels = channels or {}
     if not profile.outputs:
         raise InputError(
-            f"{profile.title} has no output: it reads the sensor for another device; name that, "
-            "and this with --reader"
+            f"{profile.title} has no output: it only reads the sensor of another device; specify "
+            "that device, and this one with --reader"
         )
     if not reader.sensor_inputs:
         raise InputError(
-            f"{reader.title} has no input for a displacement sensor: name the profile of what "
-            "reads it with --reader"
+            f"{reader.title} has no input for a displacement sensor: specify the profile "
+            "of the device that has one with --reader"
         )
     made = StartingSection(profile.title, {"kind": profile.DEVICE}, notes=profile.notes)
     made.values["profile"] = name_or_path
@@ -165,10 +165,10 @@ def _sensor(made: StartingSection, sensor_input: Range) -> None:
 def _watchdog(made: StartingSection, has: Watchdog | str) -> None:
     if not isinstance(has, Watchdog):
         made.values["watchdog"] = "none"
-        made.remarks["watchdog"] = "it has none: if this machine dies, the output stays"
+        made.remarks["watchdog"] = "it has none: if this machine fails, the output stays"
         return
     silence_s = min(max(_SILENCE_S, has.min_s), has.max_s)
     made.values["watchdog"] = {"timeout_s": silence_s, "safe_command": 0.0}
-    made.remarks["watchdog"] = "the device's own: what it does when this machine falls silent"
+    made.remarks["watchdog"] = "the device's own: its action when this machine stops sending"
     if has.on_trip == "stored":
         made.remarks["watchdog.safe_command"] = "set: the value that is stored in the device"

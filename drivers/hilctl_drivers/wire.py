@@ -1,4 +1,4 @@
-"""What a :class:`~hilctl_drivers.dac.Dac` is made of for its protocol: the wire, and the watchdog.
+"""Parts of a :class:`~hilctl_drivers.dac.Dac` that depend on the protocol: wire and watchdog.
 
 Values are in the unit of the output or input, commands in that of the actuator. Errors are
 ``DeviceError`` and name neither the device nor the action: the device adds them.
@@ -16,7 +16,7 @@ from hilctl_drivers.transport.wire_time import RateLimit
 
 
 class HostWatchdog(ABC):
-    """The device's own watchdog, as the experiment wants it."""
+    """The watchdog of the device, with the settings of the experiment."""
 
     arm_s = 0.0
     """Longest time to arm it."""
@@ -27,22 +27,22 @@ class HostWatchdog(ABC):
 
     @abstractmethod
     def arm(self) -> None:
-        """Arm it; called only if the experiment wants it."""
+        """Arm it; called only if the experiment sets a watchdog."""
 
     @abstractmethod
     def disarm(self) -> None:
-        """Disarm it; called only if the experiment wants it."""
+        """Disarm it; called only if the experiment sets a watchdog."""
 
     def feed(self) -> None:  # noqa: B027  most watchdogs are fed by each exchange
         """Feed a watchdog that exchanges do not feed."""
 
     @abstractmethod
     def tripped(self) -> bool:
-        """Return whether it has tripped; False if it cannot be known."""
+        """Return whether it has tripped; False if unknown."""
 
 
 class Wire(ABC):
-    """The way to the output of a device: each protocol has one, a device that streams another.
+    """Path to the output of a device; each protocol has one, streaming devices have another.
 
     It describes itself in attributes and opens nothing before :meth:`open`.
 
@@ -82,7 +82,7 @@ class Wire(ABC):
         return self.session.old_errors()
 
     def recover(self) -> None:
-        """End what an earlier run has left, after which the device accepts its init steps."""
+        """Clean up after an earlier run, so that the device accepts its init steps."""
         self.watchdog.recover()
 
     @abstractmethod
@@ -101,7 +101,7 @@ class Wire(ABC):
 
     @abstractmethod
     def read(self) -> float | None:
-        """Return the output; None if it cannot be known."""
+        """Return the output; None if unknown."""
 
     @abstractmethod
     def look(self, reader: SensorReader) -> tuple[float, float | None]:
@@ -109,14 +109,14 @@ class Wire(ABC):
 
     @abstractmethod
     def message(self, value: float) -> bytes:
-        """Return what sets the output, as sent on a serial line."""
+        """Return the message that sets the output, as sent on a serial line."""
 
     @abstractmethod
     def confirm(self, value: float) -> None:
         """Set the output.
 
         Raises:
-            UnconfirmedError: It was sent, and no answer of the device would confirm it.
+            UnconfirmedError: It was sent, but the device cannot confirm it.
             DeviceError: The device did not confirm it.
         """
 

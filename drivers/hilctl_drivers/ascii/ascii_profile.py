@@ -2,8 +2,8 @@ r"""Profiles of devices with a text protocol or fixed frames: request templates,
 
 A template is a Python format string with the fields ``{value}``, ``{address}``, ``{timeout}`` and
 ``{safe}``, such as ``#{address:02X}0{value:+07.3f}``. A pattern is a regular expression that must
-match a whole reply. Each pattern has an example, as in the vendor's manual: it shows what the
-pattern is for, proves that it matches, and tells how long a reply is.
+match a whole reply. Each pattern has an example, as in the vendor's manual. It documents and
+verifies the pattern, and defines the length of a reply.
 
 A line feed in a template separates lines that are sent in one write, such as
 ``SVA 1 {value:.4f}\nPOS? 1``. A line feed in an example separates the lines of one reply.
@@ -55,7 +55,7 @@ def binary_format(spec: str) -> RegisterFormat | None:
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A number whose format may be a type of :func:`binary_format`: its bytes in hexadecimal."""
+    """A number that may be formatted as its bytes in hexadecimal, see :func:`binary_format`."""
 
     number: float
 
@@ -146,7 +146,7 @@ class TextLines(StreamSettings):
 
     @property
     def removes_echo(self) -> bool:
-        """No: the session takes the lines that come back, for its terminators."""
+        """False, because the session removes the echoed lines."""
         return False
 
 
@@ -171,7 +171,7 @@ class BytesLink(BinaryLineSettings):
     kind: Literal["bytes"]
     checksum: CrcName | Literal["sum8"] = Field(
         default="none",
-        description="check behind each frame, least significant byte first; sum8: low byte of the"
+        description="check after each frame, least significant byte first; sum8: low byte of the"
         " sum",
     )
 
@@ -202,7 +202,7 @@ class Reply(StrictModel):
 
 
 AnyReply: TypeAlias = Annotated[
-    Reply | Literal["none"], Field(description="form of a good reply; none if there is none")
+    Reply | Literal["none"], Field(description="form of a good reply; none without a reply")
 ]
 Ask: TypeAlias = Annotated[LineTemplate, Field(description="line that is sent")]
 Note: TypeAlias = Annotated[str, Field(description="purpose of the step")]
@@ -301,7 +301,8 @@ class AsciiOutput(ScaledRange):
     def check_field(self, key: str, template: str, field: str) -> None:
         """Raise ValueError if a field of a template overflows, or rounds by more than a step.
 
-        The text is made after the limiter: a coarse format would exceed the limits of a run.
+        The text is formatted after the limiter, so a coarse format could exceed the limits of a
+        run.
         """
         for limit in self.limits:
             try:
@@ -427,7 +428,7 @@ class AsciiWatchdog(SteppedWatchdog[AsciiStep]):
     @model_validator(mode="after")
     def _trip_shows(self) -> Self:
         if self.clear and self.tripped == "none":
-            raise ValueError("clear needs tripped: a trip must be known before it is cleared")
+            raise ValueError("clear requires tripped: a trip must be detected before it is cleared")
         return self
 
 
@@ -510,7 +511,7 @@ class AsciiProfile(BaseProfile):
 
     def misfits(self) -> Iterator[tuple[str, str, str]]:
         """See :meth:`~hilctl_drivers.profile_base.BaseProfile.misfits`."""
-        rule = "must be bytes in upper-case hexadecimal with a blank between, like 0A 1F"
+        rule = "must be bytes in upper-case hexadecimal separated by blanks, such as 0A 1F"
         if isinstance(self.link, BytesLink):
             for key, text in _texts(self, {*_REQUESTS, "example"}):
                 if not _is_bytes(text):
@@ -543,7 +544,7 @@ def _texts(part: object, names: set[str]) -> Iterator[tuple[str, str]]:
 
 
 def _is_bytes(template: str) -> bool:
-    """Return whether all lines of a template or an example are bytes as :func:`as_text` has."""
+    """Return whether all lines of a template or an example are bytes as from :func:`as_text`."""
     try:
         lines = fill(template, **SAMPLES).split("\n")
         return all(as_text(bytes.fromhex(line)) == line for line in lines)

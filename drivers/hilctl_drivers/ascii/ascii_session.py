@@ -53,10 +53,10 @@ from hilctl_drivers.transport.links import (
 from hilctl_drivers.transport.wire_time import WireTime
 
 _SCPI_INFINITY = 9.9e37
-"""SCPI-1999 sends this for infinity and 9.91e37 for not a number."""
+"""SCPI-1999 uses this for infinity, and 9.91e37 for NaN."""
 
 _ERRORS_MAX = 50
-"""More than a device's queue holds; one that reports its state has no queue."""
+"""Larger than the error queue of a device; a device that reports its state has no queue."""
 _CHECKSUMS = {"none": lambda _text: b"", "dcon": dcon_checksum, "gen": gen_checksum}
 _CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
 _NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?", re.ASCII)
@@ -92,8 +92,8 @@ class LineFormat:
         """Return the text of exactly one line.
 
         Raises:
-            IncompleteError: The terminator has not come yet.
-            CorruptError: Wrong checksum, too long, not printable ASCII, or bytes behind the end.
+            IncompleteError: The terminator has not arrived yet.
+            CorruptError: Wrong checksum, too long, not printable ASCII, or bytes after the end.
         """
         data = bytes(line)
         end = data.find(self.terminator)
@@ -114,7 +114,7 @@ class LineFormat:
         return len(text) + _lines(text) * extra - text.count("\n")
 
     def missing(self, example: str) -> Missing:
-        """Return how much is missing of a message with as many lines as ``example``."""
+        """Return the number of bytes missing from a message with as many lines as ``example``."""
         lines = _lines(example)
 
         def missing(got: bytearray) -> int:
@@ -169,7 +169,7 @@ class FrameFormat:
         return len(b"".join(map(self.encode, text.split("\n"))))
 
     def missing(self, example: str) -> Missing:
-        """Return how much is missing of a frame as long as ``example``."""
+        """Return the number of bytes missing from a frame as long as ``example``."""
         size = self.size(example)
         return lambda got: max(0, size - len(got))
 
@@ -199,7 +199,7 @@ def parse_number(text: str, binary: RegisterFormat | None = None) -> float:
     With ``binary`` the text is the number's bytes in hexadecimal; NaN if the device sent it.
 
     Raises:
-        CorruptError: Anything else, or SCPI's marks for infinity and not a number.
+        CorruptError: Anything else, or the SCPI values for infinity and NaN.
     """
     if binary is not None:
         return binary.decode(bytes.fromhex(text))
@@ -209,12 +209,12 @@ def parse_number(text: str, binary: RegisterFormat | None = None) -> float:
     value = float(body)
     if abs(value) >= _SCPI_INFINITY:
         rule = "if it is a reading, set invalid of its input in the profile"
-        raise CorruptError(f"stands for no measurement: {text!r}; {rule}")
+        raise CorruptError(f"means no measurement: {text!r}; {rule}")
     return value
 
 
 def reading(form: MeasuredReply, ask: Callable[..., re.Match[str]]) -> float:
-    """Return the number in a reply of that form, NaN if it marks the reading as invalid.
+    """Return the number in a reply of a form, or NaN if the reply marks the reading as invalid.
 
     ``ask`` takes forms and returns the match of the reply.
     """
@@ -227,7 +227,7 @@ def reading(form: MeasuredReply, ask: Callable[..., re.Match[str]]) -> float:
 
 
 class AsciiSession(SteppedSession):
-    """A link to one device, which answers each line before the next is sent.
+    """A link to one device, which answers each line before the next one is sent.
 
     Several devices may share a link. The address is as shipped if it is None.
     """
@@ -293,11 +293,11 @@ class AsciiSession(SteppedSession):
         return fill(template, address=self.address, **values)
 
     def line(self, text: str) -> bytes:
-        """Return a text of one or more messages in the form sent on the wire."""
+        """Encode a text of one or more messages for the wire."""
         return b"".join(map(self._requests.encode, text.split("\n")))
 
     def send(self, text: str) -> None:
-        """Send a text that is not answered."""
+        """Send a text that has no reply."""
         request = self.line(text)
         if self._echoes:
             self._check_echo(text, self.link.transact(request, self._replies.missing(text)))
@@ -305,20 +305,20 @@ class AsciiSession(SteppedSession):
             self.link.transact(request, lambda got: 0)
 
     def ask(self, text: str, *forms: Reply) -> re.Match[str]:
-        """Send a text and return its reply, matched whole by the first form that does.
+        """Send a text and return its reply as matched by the first fitting form.
 
-        All forms have as many lines.
+        All forms have the same number of lines.
 
         Raises:
             WatchdogTrippedError: The command was ignored because of a trip.
             RefusedError: The reply is one of the profile's errors.
-            MismatchError: It is no answer to this.
+            MismatchError: The reply does not belong to this request.
             DeviceError: No answer, or a damaged one.
         """
         return _matched(text, forms, self._transact(text, forms[0].example))
 
     def query(self, text: str, *forms: Reply) -> re.Match[str]:
-        """Ask a question, see :meth:`ask`; a reply that repeats it is a MismatchError."""
+        """Send a query, see :meth:`ask`; a reply that repeats the query is a MismatchError."""
         return _matched(text, forms, self._question(text, forms[0].example))
 
     def number(self, query: Query) -> float:
@@ -356,7 +356,7 @@ class AsciiSession(SteppedSession):
                 raise DeviceError(f"{error}{f' ({note})' if note else ''}") from None
 
     def check_errors(self) -> None:
-        """Ask for errors that commands without an answer have left; raise RefusedError for one."""
+        """Query errors of earlier commands without a reply; raise RefusedError if there is one."""
         query = self.profile.error_query
         if query != "none":
             text, reply = self._ask(query)
@@ -364,9 +364,9 @@ class AsciiSession(SteppedSession):
                 raise RefusedError(f"{text} says {reply}", reply)
 
     def old_errors(self) -> list[str]:
-        """Take the errors of earlier sessions out of the device; return its replies.
+        """Read and clear the errors of earlier sessions; return the replies.
 
-        Raise RefusedError if it still has errors after as many queries as no queue has places.
+        Raise RefusedError if errors remain after more queries than any queue has entries.
         """
         found: list[str] = []
         while (query := self.profile.error_query) != "none":
@@ -393,7 +393,7 @@ class AsciiSession(SteppedSession):
                 raise DeviceError(f"{text} must be answered like {test.example!r}, got {reply!r}")
 
     def tripped(self) -> bool:
-        """Return whether the host watchdog has tripped; False if it cannot be asked."""
+        """Return whether the host watchdog has tripped; False if the device has no query for it."""
         watchdog = self.profile.watchdog
         if watchdog == "none" or watchdog.tripped == "none":
             return False
@@ -405,9 +405,9 @@ class AsciiSession(SteppedSession):
         return text, self._question(text, check.example)
 
     def _question(self, text: str, example: str) -> str:
-        """Return the reply to a question; one that repeats it is a MismatchError.
+        """Return the reply to a query; a reply that repeats the query is a MismatchError.
 
-        The line then echoes, and perhaps nothing is connected.
+        In this case the line echoes, possibly with no device connected.
         """
         reply = self._transact(text, example)
         if reply == text:
@@ -415,7 +415,7 @@ class AsciiSession(SteppedSession):
         return reply
 
     def _transact(self, text: str, example: str) -> str:
-        """Send a text and return its reply, which is as long as ``example`` and no error."""
+        """Send a text and return its reply, which has the length of ``example`` and is no error."""
         missing = self._replies.missing(f"{text}\n{example}" if self._echoes else example)
         try:
             data: bytes | bytearray = self.link.transact(self.line(text), missing)
@@ -457,7 +457,7 @@ class AsciiSession(SteppedSession):
                 raise RefusedError(f"{printable(text)}: {error.meaning} ({reply})", reply)
         who = _ADDRESSED.match(reply)
         if who and text[1:3] == f"{self.address:02X}" and who[1] != text[1:3]:
-            raise MismatchError(f"{printable(text)}: answered by address {who[1]}: {reply!r}")
+            raise MismatchError(f"{printable(text)}: reply comes from address {who[1]}: {reply!r}")
 
     def _check_echo(self, text: str, data: bytes | bytearray) -> bytes | bytearray:
         assert isinstance(self._replies, LineFormat)
@@ -476,8 +476,8 @@ def _lines(text: str) -> int:
 
 def _came_back(text: str) -> MismatchError:
     return MismatchError(
-        f"{printable(text)}: came back unchanged: the line echoes what is sent; set echo: true "
-        "beside the address if the device answers after that"
+        f"{printable(text)}: was returned unchanged: the line echoes requests; set echo: true "
+        "beside the address if the device replies after the echo"
     )
 
 
@@ -486,16 +486,16 @@ def _matched(text: str, forms: Sequence[Reply], reply: str) -> re.Match[str]:
     if found is None and reply == text:
         raise _came_back(text)
     if found is None:
-        raise MismatchError(f"{printable(text)}: not an answer to this: {reply!r}")
+        raise MismatchError(f"{printable(text)}: reply does not match this request: {reply!r}")
     return found
 
 
 _Line: TypeAlias = tuple[str, str | None]
-"""Text that is sent in one write, and an example of its reply; None if it is not answered."""
+"""Text that is sent in one write, and an example of its reply; None without a reply."""
 
 
 def exchange_time(profile: AsciiProfile, output: str, sensor: str | None) -> WireTime:
-    """Return the time to set an output, with the longest value, and to ask for an input, if any."""
+    """Return the time to set an output, with the longest value, and to query an input, if any."""
     channel, combined = profile.outputs[output], profile.exchange
 
     def longest(template: str) -> str:
@@ -513,7 +513,7 @@ def exchange_time(profile: AsciiProfile, output: str, sensor: str | None) -> Wir
 
 
 def query_time(profile: AsciiProfile, query: AsciiInput) -> WireTime:
-    """Return the time of a question besides the exchange."""
+    """Return the time of a query in addition to the exchange."""
     return _lines_time(profile, [_question(profile, query)], query.settle_s)
 
 

@@ -33,13 +33,13 @@ from hilctl_drivers.transport.wire_time import RateLimit, WireTime
 from hilctl_drivers.wire import HostWatchdog, Wire
 
 _NO_EVIDENCE = (
-    "the device cannot confirm it: it does not answer, or repeats what it is sent, and its profile "
+    "the device cannot confirm it: it sends no reply, or repeats the request, and its profile "
     "has neither readback nor error_query"
 )
 
 
 class TextWatchdog(HostWatchdog):
-    """A watchdog that lines set; ``write`` and ``confirm`` set the output."""
+    """A watchdog set by lines of text; ``write`` and ``confirm`` set the output."""
 
     def __init__(
         self,
@@ -117,7 +117,7 @@ class TextWire(Wire):
         if readback != "none" and not (blind and readback.of == "command"):
             self._readback = readback
         self.reads_output = self._readback is not None
-        # Half duplex: what was asked last is answered before the safe value can go out.
+        # Half duplex: the last request is answered before the safe value can be sent.
         write = exchange_time(profile, options.output, None)
         busy = self._own_time()
         if setup.shares_link or setup.aux or setup.digital_output:
@@ -154,7 +154,7 @@ class TextWire(Wire):
             number = reading(combined, partial(self.session.ask, text))
             found = self._profile.inputs[combined.input].value(number)
         else:
-            # First the reading, which must not show yet what the command does.
+            # First the reading, which must not show the effect of the command yet.
             found = self._reader.read()
             self._write(value)
         displacement_um[0] = chain.displacement_um(found)
@@ -168,14 +168,14 @@ class TextWire(Wire):
     def look(self, reader: SensorReader) -> tuple[float, float | None]:
         """See :meth:`~hilctl_drivers.wire.Wire.look`."""
         found, output = reader.read(), self._measured_output()
-        # A wrong query must show here: a run asks these last.
+        # A wrong query must be detected here, because a run sends these last.
         if self._target.readback != "none":
             self.session.number(self._target.readback)
         self.session.check_errors()
         return found, output
 
     def _measured_output(self) -> float | None:
-        """Return the output as the device measures it, or as it says that it is, tripped or not."""
+        """Return the output as measured or reported by the device, tripped or not."""
         unit = self._target.unit
         for source in self._profile.inputs.values():
             if source.measures == "output" and source.unit == unit:
@@ -186,12 +186,12 @@ class TextWire(Wire):
         return self.read()
 
     def _write(self, value: float) -> bool:
-        """Write the output; return whether the answer shows that a device has received it."""
+        """Write the output; return whether the reply proves that a device has received it."""
         text, reply = self._command(value), self._target.reply
         if reply == "none":
             self.session.send(text)
             return False
-        # A line that echoes gives an answer that equals what was sent.
+        # On a line with echo the reply equals the request.
         return self.session.ask(text, reply).string != text
 
     def _command(self, value: float) -> str:
@@ -221,9 +221,9 @@ class TextWire(Wire):
             raise UnconfirmedError(f"the value was sent, but {_NO_EVIDENCE}")
 
     def _try_out_safe_value(self) -> None:
-        """Set the output to what it holds, with the command of the safe value; nothing moves.
+        """Write the present output with the command of the safe value; nothing moves.
 
-        An output that cannot be read is left alone, and so is a value that the command would round.
+        Skipped if the output cannot be read, or if the command would round its value.
         """
         value = self.read()
         if value is None:

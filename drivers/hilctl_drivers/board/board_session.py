@@ -35,9 +35,9 @@ _CODES = {"int16": "i2", "uint16": "u2", "int32": "i4", "uint32": "u4", "float32
 _REASONS = {
     board.Status.TRIPPED: "the watchdog has tripped: the output is at its safe value",
     board.Status.OUT_OF_RANGE: "a value is out of range",
-    board.Status.BAD_MESSAGE: "it does not understand the message, or not now",
+    board.Status.BAD_MESSAGE: "unknown message, or not accepted now",
     board.Status.FIFO_FULL: "its FIFO is full",
-    board.Status.WRONG_FIRST: "samples are missing or came twice",
+    board.Status.WRONG_FIRST: "samples are missing or duplicate",
 }
 
 
@@ -96,7 +96,7 @@ class BoardFacts:
 
 @dataclass(frozen=True, slots=True)
 class Readings:
-    """Reply to EXCHANGE or STREAM."""
+    """Readings in a reply to EXCHANGE or STREAM."""
 
     first: int  # sample that the first value belongs to; 0 for an EXCHANGE
     values: F64  # float64[n] in the input's unit
@@ -114,7 +114,7 @@ class BoardState:
 
 
 class BoardSession(Session):
-    """A link to one board, which answers each message before the next is sent."""
+    """A link to one board, which answers each message before the next one is sent."""
 
     READS_ANY = False
 
@@ -140,7 +140,7 @@ class BoardSession(Session):
         return replace(wire, what=f"STATE {wire.what}", settle_s=source.settle_s)
 
     def restart(self) -> None:
-        """Number messages from the first again, as on a new connection."""
+        """Restart the numbering of messages, as on a new connection."""
         self._seq = 0
 
     def identify(self) -> None:
@@ -207,7 +207,7 @@ class BoardSession(Session):
             return None
         size = self.outputs.size
         if len(rest) != size + self.inputs.size:
-            raise MismatchError(f"{len(rest)} bytes behind the flags of a state")
+            raise MismatchError(f"{len(rest)} bytes after the flags of a state")
         output, reading = self.outputs.decode(rest[:size]), self.inputs.decode(rest[size:])
         tripped = bool(flags & board.StateFlag.TRIPPED)
         return BoardState(tripped, float(output[0]), float(reading[0]))
@@ -216,7 +216,7 @@ class BoardSession(Session):
         """Query output and input; raise DeviceError if the board does not know this message."""
         state = self.state()
         if state is None:
-            raise DeviceError("the board speaks version 1 of the protocol: no message only reads")
+            raise DeviceError("protocol version 1 of the board has no read-only message")
         return state
 
     def exchange(self, value: F64) -> Readings:
@@ -226,7 +226,7 @@ class BoardSession(Session):
         return self._readings(0, count, rest)
 
     def stream(self, first: int, values: F64) -> Readings:
-        """Queue float64[n] as samples ``first`` and on; return the readings that are due."""
+        """Queue float64[n] as samples from ``first`` on; return the readings that are due."""
         body = board.STREAM_FIELDS.pack(first & 0xFFFFFFFF, values.size)
         body += self.outputs.encode(values)
         (back_first, count), rest = self.ask(board.STREAM, body, board.STREAM_FIELDS)
@@ -235,7 +235,7 @@ class BoardSession(Session):
     def _readings(self, first: int, count: int, rest: bytes) -> Readings:
         size = count * self.inputs.size
         if len(rest) != size + board.FIFO_TAIL.size:
-            raise MismatchError(f"{len(rest)} bytes behind the head of a reply with {count} values")
+            raise MismatchError(f"{len(rest)} bytes after the head of a reply with {count} values")
         level, underruns = board.FIFO_TAIL.unpack_from(rest, size)
         return Readings(first, self.inputs.decode(rest[:size]), level, underruns)
 
@@ -245,7 +245,7 @@ class BoardSession(Session):
         body = board.WATCHDOG_FIELDS.pack(timeout_ms) + self.outputs.encode(np.array([safe]))
         (taken_ms,), _ = self.ask(board.WATCHDOG, body, board.WATCHDOG_FIELDS)
         if taken_ms != timeout_ms:
-            raise DeviceError(f"watchdog was set to {timeout_ms} ms, the board took {taken_ms}")
+            raise DeviceError(f"watchdog was set to {timeout_ms} ms, the board set {taken_ms}")
 
     def put_out(self, value: float) -> None:
         """Output ``value`` immediately; queued samples are dropped."""

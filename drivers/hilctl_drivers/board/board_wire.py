@@ -2,8 +2,9 @@
 
 A board with a FIFO answers a block when it has output all but ``prefill`` of the queued samples,
 and returns their readings. Its clock therefore sets the pace, and the readings of a block come
-``fifo_blocks`` exchanges after it. Between two exchanges the FIFO holds that many blocks: so long
-may this machine stall. The board outputs the first sample when that many blocks are queued.
+``fifo_blocks`` exchanges after it. Between two exchanges the FIFO holds that many blocks, which is
+the longest tolerable stall of this machine. The board outputs the first sample when that many
+blocks are queued.
 """
 
 from typing import cast
@@ -34,7 +35,7 @@ _FIRST_MAX = 2**32
 
 
 class BoardWatchdog(HostWatchdog):
-    """The watchdog of a board, if it has one; any message feeds it, and setting it ends a trip."""
+    """The watchdog of a board, if any; every message feeds it, and setting it ends a trip."""
 
     def __init__(self, setup: DacSetup, session: BoardSession) -> None:
         self._session = session
@@ -79,7 +80,7 @@ class BoardWire(Wire):
         self._fifo_blocks = getattr(setup.options, "fifo_blocks", 0)
         self._block = self._next_sample = 0
         self.fifo_level_min = 0
-        """Lowest level that an answer has reported since the output began to move."""
+        """Lowest FIFO level in a reply since the output began to move."""
         streaming = profile.streaming
         if streaming == "none":
             return
@@ -98,7 +99,7 @@ class BoardWire(Wire):
         return self.setup.rates(wire, lowest_hz, settle_s(self._profile))
 
     def open(self, block_s: float = 0.0) -> list[str]:
-        """Connect and check that it is a board that this profile describes."""
+        """Connect and check that the board matches this profile."""
         self.link.set_timeout(self.setup.writer.timeout_s + block_s)
         self.link.open()
         self.session.restart()
@@ -107,7 +108,7 @@ class BoardWire(Wire):
         slack = 1e-6 * (high - low)
         if low < facts.low - slack or high > facts.high + slack:
             raise DeviceError(
-                f"{facts.name} puts out {facts.low:g} to {facts.high:g}, "
+                f"{facts.name} outputs {facts.low:g} to {facts.high:g}, "
                 f"the profile says {low:g} to {high:g}"
             )
         return []
@@ -130,17 +131,17 @@ class BoardWire(Wire):
         if self.fifo_depth:
             readings = self._queue(first_sample, values)
         else:
-            # First the reading, which must not show yet what the command does.
+            # First the reading, which must not show the effect of the command yet.
             read = None if self._reader is None else self._reader.read()
             readings = self.session.exchange(values).values
             if readings.size != 1:
-                raise DeviceError(f"{readings.size} readings came for one sample")
+                raise DeviceError(f"{readings.size} readings received for one sample")
             readings = readings if read is None else np.array([read])
         if readings.size:
             self.setup.chain.fill_um(readings, displacement_um)
 
     def _queue(self, first_sample: int, values: F64) -> F64:
-        """Queue a block and wait for the readings of the one that it pushes out."""
+        """Queue a block and wait for the readings of the block that leaves the FIFO."""
         check_next(first_sample, self._next_sample)
         found = self.session.stream(first_sample, values)
         self._check_answer(found, first_sample)
@@ -187,7 +188,7 @@ class BoardWire(Wire):
         self.watchdog.disarm()  # which ends a trip of an earlier run
         if state is None:
             return
-        # At once: a board that comes back to a command from before must not keep it.
+        # Immediately: a board that returns to an earlier command must not keep it.
         value = self.watchdog.safe if state.tripped else state.output
         put_out = self.session.put_out
         try_out(self.setup.output, value, lambda: put_out(value), "by SAFE")

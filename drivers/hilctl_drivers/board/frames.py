@@ -10,7 +10,7 @@ Each message is the payload of one binary frame, least significant byte first th
            -> 91  status u8, first u32, n u16, n values, fifo_level u16, underruns u16
     WATCHDOG  12  timeout_ms u32 (0: off), safe value   clears a trip, too
            -> 92  status u8, timeout_ms u32
-    SAFE      13  value                    puts it out at once and drops what is queued
+    SAFE      13  value                    outputs it immediately, drops queued samples
            -> 93  status u8
     INFO      14  (nothing)
            -> 94  status u8, version u8, fifo_depth u16, block_max u16, rate_max_hz f32,
@@ -28,10 +28,9 @@ counts that in ``underruns``. A refused message changes nothing.
 
 A STREAM reply is held back until sample ``queued - prefill - 1`` is out, with ``queued`` the
 samples taken since CLOCK, this message included, and carries the readings up to that sample.
-Sample j is output (j + 1 + underruns) periods after the clock's start. While ``queued <=
-prefill``, where the moment is past, and where the status is not 0, the reply goes out at once. A
-newer message means that a reply held back is never sent; where the watchdog trips meanwhile, it
-says TRIPPED.
+Sample j is output (j + 1 + underruns) periods after the clock's start. The reply is sent
+immediately while ``queued <= prefill``, if that moment has passed, or if the status is not 0. A
+newer message cancels a delayed reply; if the watchdog trips meanwhile, its status is TRIPPED.
 """
 
 from enum import IntFlag
@@ -39,7 +38,7 @@ from struct import Struct
 from typing import Final
 
 VERSIONS: Final = (1, 2)
-"""Versions that are spoken here; in 2 STATE came in."""
+"""Supported versions; STATE requires version 2."""
 REPLY_BIT: Final = 0x80
 """Set in a reply's type."""
 
@@ -86,7 +85,7 @@ class Status(IntFlag):
     FIFO_FULL = 0x08
     """Refused: more samples than the FIFO has room for."""
     WRONG_FIRST = 0x10
-    """Refused: ``first`` is not the next sample; a block was lost or came twice."""
+    """Refused: ``first`` is not the next sample; a block was lost or duplicated."""
 
 
 class StateFlag(IntFlag):

@@ -83,7 +83,7 @@ class EmulatedBoard(SerialDevice):
         return EmulatedReply(board.REPLY_HEAD.pack(kind | board.REPLY_BIT, seq, status))
 
     def wrong_id(self, reply: bytes) -> bytes:
-        """Return a reply as if to another message."""
+        """Return a reply with the number of another message."""
         return reply[:1] + bytes([reply[1] ^ 0x55]) + reply[2:]
 
     @property
@@ -168,7 +168,7 @@ class EmulatedBoard(SerialDevice):
         return b""
 
     def _stop(self) -> None:
-        """Stop streaming and forget all of it; the output holds its value."""
+        """Stop streaming and discard its state; the output holds its value."""
         if self.fifo.started:
             self._rig.put_out(self.fifo.command, self._now_ns)
         self.fifo.stop()

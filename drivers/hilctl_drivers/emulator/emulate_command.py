@@ -61,7 +61,7 @@ class WiredExperiment:
 
 
 def is_experiment(name: str) -> bool:
-    """Return whether a name is that of an experiment file."""
+    """Return whether a name belongs to an experiment file."""
     path = Path(name)
     if path.suffix not in {".yaml", ".yml"} or not path.is_file():
         return False
@@ -71,13 +71,13 @@ def is_experiment(name: str) -> bool:
 def wired_experiment(
     path: Path, port: int = 0, host: str | None = None, actuator: Sequence[str] = ()
 ) -> WiredExperiment:
-    """Return what to emulate for an experiment; raise InputError if it has no profile."""
+    """Return the device of an experiment to emulate; raise InputError if it has no profile."""
     # Port 0 stands for that of the experiment, or for a free one if users may not listen there.
     document, files = load_document(path), TextFiles()
     section = document.data.get("device")
     name = section.get("profile") if isinstance(section, dict) else None
     if not isinstance(section, dict) or not isinstance(name, str):
-        rule = "must name a profile: what has none is not behind a wire, and needs no emulator"
+        rule = "must name a profile: a device without one has no connection to emulate"
         raise ConfigError([document.problem("device.profile", rule)])
     # The options of a device of any protocol: those of serial_dac include all.
     context = {"folder": path.parent, "files": files}
@@ -140,7 +140,7 @@ def _actuator(
 
 
 def _link(options: AddressOptions) -> LinkKind | None:
-    """Return how to serve a device at an address; None at that of the other one."""
+    """Return how to serve a device at an address; None if it shares that of the other one."""
     if options.serial_port is not None:
         return "rtu"
     if options.host is None:
@@ -290,7 +290,7 @@ def serve(options: EmulatorOptions, on_ready: Callable[[Emulator], None]) -> Non
         emulator.server.stop()
 
     gc.collect()
-    gc.freeze()  # a collection of all that was imported takes tens of ms
+    gc.freeze()  # collecting all imported objects takes tens of ms
     before = {each: signal.signal(each, stop) for each in (signal.SIGINT, signal.SIGTERM)}
     try:
         on_ready(emulator)

@@ -49,7 +49,7 @@ class ListenAddress(NamedTuple):
 
 @dataclass(frozen=True, slots=True)
 class Emulator:
-    """A server that is ready to run; its log is to be closed at the end."""
+    """A server that is ready to run; close its log at the end."""
 
     server: EmulatorServer
     log: WriteLog
@@ -116,7 +116,7 @@ class _Plan:
         if "stall" in faults and not isinstance(reader, StreamProfile):
             raise InputError(f"fault stall: {reader.title} does not send unasked")
         self._apart = reader is not profile and not self._may_share(options.reader_line)
-        """Whether the reader is on a wire of its own."""
+        """Whether the reader has its own wire."""
         self.reader_unit_id = self._unit_of_reader()
         if "reset" in faults and not (self._served.tcp and self._shown.tcp):
             raise InputError("fault reset is for tcp: a serial line has no connection to break")
@@ -228,7 +228,7 @@ class _Served:
 
     @classmethod
     def of(cls, name: str, wanted: LinkKind | None, port: int, *, faulty: bool = True) -> "_Served":
-        """Return what an option wants of a device, or what its profile says."""
+        """Return the serving options of a device: those set, otherwise those of its profile."""
         profile = load_profile(name)
         if isinstance(profile, ModbusProfile):
             kind = wanted or profile.link.kind
@@ -237,7 +237,7 @@ class _Served:
         return cls(profile, wanted == "tcp" or not on_line, "rtu", port, faulty)
 
     def wire(self, devices: dict[Any, Any]) -> EmulatedWire:
-        """Return a wire with devices by unit, the last one the first to be asked."""
+        """Return a wire with devices by unit; the last one is asked first."""
         if isinstance(self.profile, ModbusProfile):
             return ModbusWire(self.framing, devices)
         members = list(devices.values())[::-1]
@@ -253,7 +253,7 @@ class _Served:
         return server.open_pty(wire, faulty=self.faulty)
 
     def place(self, address: str) -> dict[str, Any]:
-        """Return an address as in a device section."""
+        """Return an address in the form of a device section."""
         if not self.tcp:
             return {"serial_port": address}
         host, _, port = address.rpartition(":")
@@ -269,7 +269,7 @@ def _rig(
     actuator, given, limits = options.actuator, options.wiring, options.limits
     wiring = None if given is None else SimulatedWiring(output, sensor_input, *given)
     if limits is not None and isinstance(actuator, TerfenolOptions):
-        # What the user has stated is stronger.
+        # Options of the user take precedence.
         rated = {"rated_current_a": max(map(abs, limits))} | actuator.model_dump(exclude_unset=True)
         actuator = TerfenolOptions.model_validate(rated)
         if wiring is not None and "vary" not in rated:
@@ -300,7 +300,7 @@ def _rig(
 
 
 def _stroke_um(actuator: TerfenolOptions, command: float) -> float:
-    """Return the displacement of an actuator some time after a step to a command, um."""
+    """Return the displacement of an actuator in um, some time after a step to a command."""
     rig = Rig(0, SimulatedTerfenol(actuator))
     rig.put_out(command, 0)
     rig.advance(_SETTLED_NS)

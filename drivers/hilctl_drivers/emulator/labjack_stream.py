@@ -48,7 +48,7 @@ class LabJackInput:
         self._full, self._skipped = False, 0
 
     def keep(self, volts: F64) -> None:
-        """Buffer float64[n] readings; once it was full, drop all until it has been emptied."""
+        """Buffer float64[n] readings; after an overflow, drop all until the buffer is empty."""
         raw = self._raw(volts)
         if self._full:
             self._skipped += len(raw)
@@ -60,7 +60,7 @@ class LabJackInput:
             self._skipped = len(raw) - room
 
     def fetch(self, words: int) -> bytes:
-        """Return what ``words`` registers from DATA_CR on hold, and forget it."""
+        """Return and remove the content of ``words`` registers from DATA_CR on."""
         room = words - stream.DATA_HEAD.size // 2
         given, self._readings = self._readings[:room], self._readings[room:]
         status, more = (_DROPPING, 0) if self._full else (0, 0)
@@ -119,7 +119,7 @@ class LabJackStream:
         self._now_ns = 0
 
     def has(self, address: int) -> bool:
-        """Return whether an address is the stream's business; inputs are while it runs."""
+        """Return whether an address belongs to the stream; inputs do while it runs."""
         known = address in self._words or address in self._reads or address in self._writes
         scanned = stream.SCANLIST_ADDRESS <= address < stream.SCANLIST_ADDRESS + 256
         return known or scanned or (self.fifo.running and address in self._analog)
@@ -136,7 +136,7 @@ class LabJackStream:
         self.input.keep(volts.ravel())
 
     def stop(self, now_ns: int) -> None:
-        """Stop streaming at a time that may be past; the output holds its value."""
+        """Stop streaming at a time, possibly in the past; the output holds its value."""
         self.tick(now_ns)
         self.fifo.stop()
 
@@ -240,7 +240,7 @@ def _require(good: bool, exception: int) -> None:
 
 
 def _plain(profile: ModbusProfile, streaming: LabJackStreaming) -> set[int]:
-    """Return addresses that hold two words and do nothing by themselves."""
+    """Return addresses of two words without side effects."""
     settings = {
         stream.SCANRATE_HZ, stream.NUM_ADDRESSES, stream.SETTLING_US, stream.RESOLUTION_INDEX,
         stream.BUFFER_SIZE_BYTES, stream.AUTO_TARGET, stream.DATATYPE, stream.NUM_SCANS,

@@ -11,15 +11,14 @@ from hilctl_drivers.modbus.modbus_profile import ModbusProfile, ModbusWatchdog
 from hilctl_drivers.modbus.register_map import EnsureStep, ModbusStep, RegisterStep, WriteStep
 
 Target = tuple[Words, bytes | None]
-"""A value and the words that trigger something; None stands for any words but zeros."""
+"""A value and the words that trigger an action; None means any words except zeros."""
 
 
 class EmulatedWatchdog(WatchdogTimer):
-    """Trips when the host has been silent for the timeout.
+    """Watchdog that trips when the host has been silent for the timeout.
 
-    It is armed by the last of the profile's arm steps and disarmed by the last of the disarm steps,
-    as they are written; so it starts as a new device would, disarmed. ``words`` has the value of
-    each step, by its ``id``.
+    The last arm step of the profile arms it and the last disarm step disarms it when written, so it
+    starts disarmed, as a new device does. ``words`` has the value of each step, by its ``id``.
     """
 
     def __init__(self, profile: ModbusWatchdog, words: dict[int, Words]) -> None:
@@ -50,7 +49,7 @@ class EmulatedWatchdog(WatchdogTimer):
         return super().due_ns
 
     def request(self, now_ns: int) -> None:
-        """Note that a request has come."""
+        """Note a request."""
         if self._profile.kick == "any":
             self._fed(now_ns)
 
@@ -197,7 +196,7 @@ class EmulatedModbus(EmulatedDevice):
         if self._watchdog is not None:
             self._watchdog.written(words, self._now_ns)
         for name, each in self._outputs.items():
-            # What is cleared by a step keeps the terminals until then.
+            # If a step clears the trip, the terminals keep their values until then.
             if each is words and not (self.tripped and self._holds_trip):
                 self._put_out(name, "write", self._now_ns)
         for name, output in self.profile.digital_outputs.items():
@@ -210,7 +209,7 @@ class EmulatedModbus(EmulatedDevice):
         return self.profile.watchdog != "none" and bool(self.profile.watchdog.clear)
 
     def _resume(self) -> None:
-        """Output what the registers hold, as a device may once its trip is cleared."""
+        """Output the content of the registers, as a device may after its trip is cleared."""
         # A device that refuses commands until then waits for the next command.
         watchdog = self.profile.watchdog
         if watchdog != "none" and not watchdog.refuses_while_tripped:
@@ -237,7 +236,7 @@ class EmulatedModbus(EmulatedDevice):
             self._set_terminal(name, value, "watchdog", due_ns)
 
     def _safe_value(self, name: str, steps: tuple[ModbusStep, ...]) -> float | None:
-        """Return what the safe-value register holds; None if it was not switched on."""
+        """Return the content of the safe-value register; None if it was not enabled."""
         channel = self.profile.outputs[name]
         found: float | None = None
         for step in steps:

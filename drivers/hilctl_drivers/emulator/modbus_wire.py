@@ -1,8 +1,8 @@
 """Modbus side of an emulated device: framing and messages of pymodbus.
 
-The only module that imports pymodbus. The driver has framing of its own, so a mistake in either
-shows. Its server is not used: it loses the second of two requests in one segment, and cannot inject
-faults into replies.
+The only module that imports pymodbus. The driver has its own framing, so tests detect a mistake in
+either. The server of pymodbus is not used: it loses the second of two requests in one segment, and
+cannot inject faults into replies.
 """
 
 import struct
@@ -96,7 +96,7 @@ class _Context:
 
 
 def _finish(call: Coroutine[Any, Any, ModbusPDU]) -> ModbusPDU:
-    """Return what a coroutine that never waits returns."""
+    """Return the result of a coroutine that never waits."""
     try:
         call.send(None)
     except StopIteration as end:
@@ -108,8 +108,8 @@ def _finish(call: Coroutine[Any, Any, ModbusPDU]) -> ModbusPDU:
 class ModbusWire(EmulatedWire):
     """Devices behind Modbus TCP or RTU: requests from bytes, and replies to bytes.
 
-    A device alone on a TCP connection answers to any unit id, as such devices do; on a line, or
-    behind a gateway with others, only to its own.
+    A single device on a TCP connection answers to any unit id, as real devices do; on a line, or
+    with others behind a gateway, it answers only to its own.
     """
 
     def __init__(self, kind: Literal["tcp", "rtu"], devices: Mapping[int, EmulatedModbus]) -> None:
@@ -122,7 +122,7 @@ class ModbusWire(EmulatedWire):
         self._framer = (FramerSocket if kind == "tcp" else FramerRTU)(self._decoder)
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Yield complete requests, and remove them and those for other devices."""
+        """Yield complete requests; remove these and requests for other devices."""
         while received:
             used, unit, transaction, pdu = self._framer.decode(bytes(received))
             if not used:
@@ -155,7 +155,7 @@ class ModbusWire(EmulatedWire):
             return ExceptionResponse(function, ExcCodes.ILLEGAL_VALUE)
 
     def refusal(self, request: bytes, code: int = ExcCodes.DEVICE_FAILURE) -> EmulatedReply:
-        """Return an exception reply, that of a device that fails by default."""
+        """Return an exception reply; by default, the code for a device failure."""
         return self._answered(ExceptionResponse(request[3], code), request)
 
     def corrupt_at(self, framed: bytes) -> int:

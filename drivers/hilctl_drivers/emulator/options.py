@@ -28,9 +28,9 @@ class WireFault:
 
     ``silence`` ignores the request; ``delay`` answers late; ``late`` executes it late, after other
     requests; ``exception`` refuses it; ``corrupt`` changes a byte of the reply; ``cut`` truncates
-    it; ``duplicate`` sends it twice; ``wrong_id`` answers in another's name; ``reset`` breaks the
-    connection; ``unplug`` is permanent silence on every connection; ``invalid`` marks readings as
-    invalid for a time; ``stall`` loses the samples of a stream for a time.
+    it; ``duplicate`` sends it twice; ``wrong_id`` answers with the id of another device; ``reset``
+    breaks the connection; ``unplug`` is permanent silence on every connection; ``invalid`` marks
+    readings as invalid for a time; ``stall`` loses the samples of a stream for a time.
     """
 
     kind: FaultKind

@@ -58,7 +58,8 @@ def _find(places: _Map, areas: Sequence[str], address: int) -> tuple[Words, int]
 class RegisterMap:
     """Registers that a profile names, with the values it expects; ``steps`` is by their ``id``.
 
-    Addresses are in two maps, because couplers read at one address what they do not write there.
+    There are separate maps for reading and writing, because an address of a coupler can have a
+    different meaning in each.
     """
 
     def __init__(self, profile: ModbusProfile) -> None:
@@ -73,7 +74,7 @@ class RegisterMap:
         self._place_rest()
 
     def read(self, areas: Sequence[str], address: int, count: int) -> bytes:
-        """Return words as they are read, each from the first area that has it."""
+        """Return words as read, each from the first area that contains it."""
         found = (_find(self._readable, areas, address + k) for k in range(count))
         return b"".join(words.data[2 * k : 2 * k + 2] for words, k in found)
 
@@ -97,7 +98,7 @@ class RegisterMap:
     def _share(
         self, words: Words, area: str, address: int, *, read: bool = True, write: bool = True
     ) -> Words:
-        """Put a value at a wire address, unless there is one already; return the value there."""
+        """Put a value at a wire address unless one exists there; return the value there."""
         maps = [self._readable] * read + [self._writable] * write
         there = next((each[area, address] for each in maps if (area, address) in each), None)
         found = words if there is None else there[0]

@@ -27,8 +27,8 @@ ACTUATORS: dict[CommandUnit, type[SimulatedDevice]] = {"A": SimulatedTerfenol, "
 class Rig:
     """The actuator with its amplifier and sensor, in real time, from rest at ``now_ns``.
 
-    The caller gives the time. The rig has then held its output since the last change, and its
-    sensor shows the last sample of its own clock: readings are one to two of its periods old.
+    The caller supplies the time. The rig has held its output since the last change, and its sensor
+    shows the last sample of its own clock, so readings are one to two periods of this clock old.
     """
 
     def __init__(self, now_ns: int, actuator: SimulatedDevice) -> None:
@@ -72,7 +72,7 @@ class SimulatedWiring(SignalChain):
         return clipped
 
     def monitor(self, command: F64, source: Range) -> F64:
-        """Return what an input at the output reads; in another unit it reads the command."""
+        """Return the reading of an input at the output; in another unit it reads the command."""
         signal = self.output(command) if source.unit == self._output_unit else command
         clipped: F64 = np.clip(signal, source.min, source.max)
         return clipped
@@ -136,7 +136,7 @@ class WriteLog:
                 if path.is_file():
                     with path.open("rb") as before:
                         if before.read(len(_BEGIN)) not in {b"", _BEGIN}:
-                            raise InputError(f"{path}: is no log of a device: give another name")
+                            raise InputError(f"{path}: is no emulator log: choose another name")
                 self._file = path.open("wb", buffering=0)
             except OSError as error:
                 raise InputError(f"{path}: cannot be written: {reason(error)}") from None
@@ -158,7 +158,7 @@ class WriteLog:
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """A rig, the wiring to it, and the log of what is output; devices may share it."""
+    """A rig, its wiring, and the log of its outputs; devices may share it."""
 
     rig: Rig
     wiring: SimulatedWiring
@@ -200,7 +200,7 @@ class EmulatedDevice(ABC):
         return self._timer.tripped
 
     def tick(self, now_ns: int) -> None:
-        """Advance the time; the watchdog may trip on the way."""
+        """Advance the time; the watchdog may trip meanwhile."""
         due_ns = self._timer.trip(now_ns)
         if due_ns is not None:
             self._trip(due_ns)
@@ -209,13 +209,13 @@ class EmulatedDevice(ABC):
 
     @abstractmethod
     def _trip(self, due_ns: int) -> None:
-        """Do what the watchdog does to the outputs."""
+        """Apply a watchdog trip to the outputs."""
 
     def _advance(self) -> None:
         self._rig.advance(self._now_ns)
 
     def _reading(self, name: str, source: Range) -> float:
-        """Return what an input reads: the displacement, or the output that all others are at."""
+        """Return the reading of an input: the displacement, or the output for all other inputs."""
         if name == self._sensor:
             return float(self.wiring.at_terminal(self._rig.displacement_um))
         return float(self.wiring.monitor(np.asarray(self._rig.command), source))
@@ -291,12 +291,12 @@ class SampleFifo:
         self._start_ns = now_ns
 
     def stop(self) -> None:
-        """Stop; what is queued stays, and the output holds its value."""
+        """Stop; queued values stay, and the output holds its value."""
         self._rate_hz = 0.0
         self._start_ns = None
 
     def clear(self) -> None:
-        """Forget what is queued."""
+        """Discard queued values."""
         self._queued = np.empty(0)
         self.level = 0
 
@@ -312,7 +312,7 @@ class SampleFifo:
         return self._start_ns + round((values + self.underruns) * 1e9 / self._rate_hz)
 
     def advance(self, now_ns: int) -> None:
-        """Output what is due by now; repeat or hold the last value where nothing is queued."""
+        """Output the values due by now; repeat or hold the last value if none is queued."""
         if self._start_ns is None or self._plant is None:
             return
         due = int((now_ns - self._start_ns) * self._rate_hz * 1e-9 + 1e-6) - self._periods

@@ -9,7 +9,7 @@ PERIOD_NS = 1_000_000
 
 
 class EmulatedStream(EmulatedDevice, EmulatedWire):
-    """A sensor on a TCP port of its own; its samples come at the profile's highest rate."""
+    """A sensor on its own TCP port; it samples at the highest rate of the profile."""
 
     profile: StreamProfile
 

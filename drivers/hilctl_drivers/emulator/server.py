@@ -47,18 +47,18 @@ class _Connection:
             return os.read(self._fd, _CHUNK) or None
         except BlockingIOError:
             return b""
-        except OSError:  # a host that died is as good as one that hung up
+        except OSError:  # a crashed host counts as disconnected
             return None
 
     def send(self, data: bytes) -> None:
-        """Send as much as there is room for; the rest with the next call."""
+        """Send as much as fits; the next call sends the rest."""
         self.unsent += data
         with suppress(OSError):  # no room, or the host has gone
             while self.unsent:
                 del self.unsent[: os.write(self._fd, self.unsent)]
 
     def unplug(self) -> None:
-        """Be silent for good; :meth:`close` is still called."""
+        """Stay silent permanently; :meth:`close` is still called."""
 
     def close(self, *, reset: bool = False) -> None:
         """Close the connection, or break it."""
@@ -212,7 +212,7 @@ class EmulatorServer:
             return
         now_ns = self._clock_ns()
         if now_ns - connection.received_ns > _STALE_NS:
-            connection.received.clear()  # half a request that was given up
+            connection.received.clear()  # an abandoned partial request
         connection.received_ns = now_ns
         connection.received += data
         for request in connection.wire.requests(connection.received):
@@ -236,7 +236,7 @@ class EmulatorServer:
 
     def _answer(self, connection: _Connection, request: bytes) -> None:
         now_ns = self._clock_ns()
-        # A new request means that the host has given up on answers that are still to come.
+        # A new request means that the host no longer waits for earlier replies.
         self._scheduled = [e for e in self._scheduled if e.superseded_by is not connection]
         heapq.heapify(self._scheduled)
         fault = None
@@ -270,7 +270,7 @@ class EmulatorServer:
             reply(now_ns)
 
     def _keep_back(self, fault: WireFault, connection: _Connection, request: bytes) -> None:
-        """Keep the request from the device, for good or until later."""
+        """Withhold the request from the device, permanently or for a time."""
         if fault.kind == "late":
             due_ns = self._clock_ns() + round(fault.delay_s * 1e9)
             self._schedule(due_ns, partial(self._execute, connection, request, None))
@@ -284,7 +284,7 @@ class EmulatorServer:
                 self._send(connection, connection.wire.encode(refusal.data))
 
     def _unplug(self) -> None:
-        """Fall silent for good, wherever faults happen."""
+        """Stay silent permanently on connections with faults."""
         for connection in [each for each in self._connections if each.faulty]:
             self._connections.remove(connection)
             self._selector.unregister(connection)

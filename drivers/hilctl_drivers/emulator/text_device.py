@@ -73,7 +73,7 @@ class EmulatedText(SerialDevice):
         self._errors: list[str] = []
 
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
-        """Execute a line; None if it is for another address."""
+        """Execute a line and return the reply; None if it is for another address."""
         self.tick(now_ns)
         text = message.decode("ascii", "replace")
         watchdog = self.profile.watchdog
@@ -94,7 +94,7 @@ class EmulatedText(SerialDevice):
         return self._rejection(_REFUSED)
 
     def _rejection(self, error: str) -> EmulatedReply:
-        """Return the profile's last error reply; without one, keep the error to be asked for."""
+        """Return the profile's last error reply; without one, keep the error for a query."""
         if self.profile.errors:
             return EmulatedReply(self.profile.errors[-1].example.encode() or None)
         self._errors.append(error)
@@ -171,7 +171,7 @@ class EmulatedText(SerialDevice):
         return reply or None
 
     def _said(self, name: str, source: AsciiInput, form: MeasuredReply, reply: str = "") -> str:
-        """Return the reply of that form with a reading, or the one that marks it as invalid."""
+        """Return the reply of a form with a reading, or the reply that marks it as invalid."""
         if form.invalid != "none" and name == self._sensor and self._is_invalid:
             return form.invalid.example
         value = min(max(self._reading(name, source), source.min), source.max)
@@ -214,7 +214,7 @@ class EmulatedText(SerialDevice):
     def _questions(self, text: str) -> str | None:
         query = self.profile.error_query
         if query != "none" and self._matches(query.ask, text):
-            # What an error looks like in bytes, the profile does not say.
+            # The profile does not describe errors in bytes.
             in_text = not isinstance(self.profile.link, BytesLink)
             return self._errors.pop(0) if self._errors and in_text else query.example
         test = self.profile.selftest

@@ -41,7 +41,7 @@ SerialProfile: TypeAlias = AsciiProfile | FrameProfile
 
 
 class EmulatedWire:
-    """Devices that share a line or a port, and their protocol; this one answers nothing."""
+    """Devices that share a line or a port, and their protocol; this base class answers nothing."""
 
     devices: Sequence[EmulatedDevice] = ()
 
@@ -88,7 +88,7 @@ class SerialDevice(EmulatedDevice):
 
     @abstractmethod
     def wrong_id(self, reply: bytes) -> bytes:
-        """Return a reply in another's name, or to something else."""
+        """Return a reply with another address, or to another request."""
 
 
 class TemplateMatcher:
@@ -109,7 +109,7 @@ class TemplateMatcher:
         self._pattern = re.compile("".join(parts), re.ASCII)
 
     def match(self, text: str) -> dict[str, float] | None:
-        """Return the fields of a line, or None if it is another one."""
+        """Return the fields of a line; None if the line does not match."""
         found = self._pattern.fullmatch(text)
         if found is None:
             return None
@@ -117,7 +117,7 @@ class TemplateMatcher:
 
 
 def _field(spec: str) -> tuple[str, Callable[[str], float]]:
-    """Return what a field matches, and what returns its number."""
+    """Return the pattern of a field, and the conversion to its number."""
     binary = binary_format(spec)
     if binary is not None:
         return rf"[0-9A-F ]{{{3 * binary.size - 1}}}", partial(parse_number, binary=binary)
@@ -170,7 +170,7 @@ class EmulatedLine(EmulatedWire):
             self._encode = lambda message: replies.encode(message.decode())
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
-        """Yield the good messages; an incomplete one is kept, however long it takes."""
+        """Yield the valid messages; an incomplete one is kept without a time limit."""
         self._received += received
         received.clear()
         for each in self._messages(self._received):
@@ -186,7 +186,7 @@ class EmulatedLine(EmulatedWire):
         return None
 
     def refusal(self, request: bytes) -> EmulatedReply | None:
-        """Return an answer of the first device that says no."""
+        """Return the refusal of the first device that gives one."""
         return self.devices[0].refusal(request)
 
     def encode(self, data: bytes) -> bytes:

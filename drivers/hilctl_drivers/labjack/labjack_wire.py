@@ -36,8 +36,8 @@ class StreamSession:
     """One stream of one device: an output played from its buffer, inputs read in each scan.
 
     The count of scans is the clock. Value number k is output in scan k, whose inputs are read just
-    before. This holds as long as the output's buffer never runs dry, which each message checks
-    before its own values come. Every error is a ``DeviceError``.
+    before. This is true as long as the output's buffer never runs empty, which each message checks
+    before it adds values. Every error is a ``DeviceError``.
 
     ``timeout_s`` is the longest wait for readings that are due, ``turnaround_s`` the longest time
     from the first to the last frame of a message.
@@ -115,7 +115,7 @@ class StreamSession:
         self._queued = self._fetched = self._backlog = self._waiting = 0
         self._parts.clear()
         self.margin = math.ceil(rate_hz * self._turnaround_s) + _MARGIN_SCANS
-        """Scans that may pass within one message: with fewer values left, some may be late."""
+        """Scans that may pass during one message; with fewer values left, some may be late."""
         self.level_min = self.capacity
         """Fewest values that a message found in the output's buffer."""
 
@@ -149,7 +149,7 @@ class StreamSession:
         rate_hz = self._rate_hz * self._inputs
         deadline = self.clock() + count / rate_hz + self._timeout_s
         while self._waiting < count:
-            # No more than one answer's worth, so that the last answer is not many.
+            # At most the scans of one reply, so that the last reply has few.
             wanted = min(count - self._waiting, stream.SAMPLES_MAX)
             if wanted > self._backlog:
                 self.sleep((wanted - self._backlog) / rate_hz)
@@ -173,7 +173,7 @@ class StreamSession:
         self._check_level(self.capacity - room)
 
     def _check_level(self, held: int) -> None:
-        """Raise if the output's buffer ran dry, or holds another number of values than expected."""
+        """Raise DeviceError if the output's buffer ran empty, or its level is not as expected."""
         level = self._queued - (self._fetched + self._backlog) // self._inputs
         self.level_min = min(self.level_min, level)
         if level < self.margin:
@@ -207,7 +207,7 @@ def stream_messages(block: int, inputs: int = 1) -> int:
 
 
 def stream_time(profile: ModbusProfile, block: int, inputs: int = 1) -> WireTime:
-    """Return the time of a block; readings come back in the messages that bring values."""
+    """Return the time of a block; messages with values return the readings."""
     messages = stream_messages(block, inputs)
     what = f"{block} samples in {messages} messages over TCP"
     return WireTime(what, 0.0, 0.0, 0, 0.0, messages * profile.turnaround_s, block)
@@ -278,7 +278,7 @@ class LabJackWire(RegisterWire):
         self.requests = stream_messages(block, len(self._sources))
 
     def exchange(self, first_sample: int, command: F64, displacement_um: F64) -> None:
-        """Queue a block and wait for the readings of the one that it pushes out."""
+        """Queue a block and wait for the readings of the block that leaves the buffer."""
         chain = self.setup.chain
         check_next(first_sample, self._next_sample)
         # Queued before the readings are waited for: meanwhile the device must not run dry.

@@ -49,10 +49,10 @@ COMMAND_RESPONSE: Final = 16
 USE_AT_ONCE: Final = 1
 """``OUT_SET_LOOP``: new values follow those that are still to be output."""
 MISSING: Final = 0xFFFF
-"""Stands for dropped scans; the first input of a scan list has no such reading."""
+"""Reading that marks dropped scans; the first input of a scan list never has it."""
 
 DATA_HEAD: Final = struct.Struct(">HHHH")
-"""samples, backlog in bytes, status, what belongs to the status."""
+"""samples, backlog in bytes, status, argument of the status."""
 _FLOAT_BYTES = 4
 _U32_WORDS = 2
 
@@ -101,7 +101,7 @@ def stream_data(data: bytes, free: bytes) -> tuple[npt.NDArray[np.uint16], int, 
         text = STATUS.get(status, "stream status {}")
         raise DeviceError(text.format(more if status in STATUS else status))
     if count > SAMPLES_MAX:
-        raise MismatchError(f"{count} samples in an answer that holds {SAMPLES_MAX}")
+        raise MismatchError(f"{count} samples in a reply with room for {SAMPLES_MAX}")
     raw = np.frombuffer(data, ">u2", count, DATA_HEAD.size).astype(np.uint16)
     if (raw == MISSING).any():
         raise DeviceError("scans are missing from the stream")
@@ -129,7 +129,7 @@ class InputCalibration:
             found = cls(0.0, slope, -slope, offset)
         numbers = (found.center, found.positive_v, found.negative_v, found.offset_v)
         if not np.isfinite(numbers).all() or found.positive_v <= 0.0 or found.negative_v >= 0.0:
-            raise DeviceError(f"calibration constants in flash are none: {data.hex(' ')}")
+            raise DeviceError(f"calibration constants in flash are invalid: {data.hex(' ')}")
         return found
 
     def volts(self, raw: npt.NDArray[np.uint16]) -> F64:

@@ -31,7 +31,7 @@ from hilctl_drivers.profile_base import (
 )
 
 BYTES_A_SAMPLE = 2
-"""A T-series device keeps a sample of either buffer as 16 bits."""
+"""A T-series device stores a sample in either buffer as 16 bits."""
 
 
 class LabJackStreaming(StrictModel):
@@ -79,7 +79,7 @@ FAST_GAP_S = 1.75e-3
 
 
 MODBUS_PORT = 502
-"""TCP port that is registered for Modbus."""
+"""TCP port registered for Modbus."""
 
 
 class ModbusTcpLink(LinkSettings):
@@ -141,7 +141,7 @@ class ModbusOutput(Channel):
 
     @property
     def readback_register(self) -> Register | None:
-        """Where the value can be read again with the output's scale; None if it cannot be."""
+        """Register to read back the value with the output's scale; None if there is none."""
         if self.readback == "none":
             return None
         if self.readback == "same":

@@ -1,8 +1,8 @@
 """Session with a Modbus device: registers, steps, exchange times, and the requests of a tick.
 
 The requests of a tick are prepared once, as functions that keep the constant parts of the request
-and of its good reply. A tick adds number, data and CRC, and compares. Only a reply that differs is
-parsed by :mod:`hilctl_drivers.modbus.pdu`, which raises the error.
+and of its good reply. A tick adds number, data and CRC, and compares the reply. Only a different
+reply is parsed by :mod:`hilctl_drivers.modbus.pdu`, which raises the error.
 """
 
 import itertools
@@ -87,9 +87,9 @@ def _tcp_missing(received: Bytes) -> int:
 
 
 def _rtu_call(session: "ModbusSession", pdu: bytes) -> Call:
-    """Return a function that sends a PDU by Modbus RTU; there is no number to tell a late reply by.
+    """Return a function that sends a PDU by Modbus RTU; it has no number to detect a late reply.
 
-    CRCs of what never changes are computed once; the rest is taken two bytes at a time.
+    CRCs of constant bytes are computed once; the others two bytes at a time.
     """
     unit, transact, table = session.unit, session.link.transact, MODBUS_WORDS
     data_at, (head, read_size) = modbus.DATA_AT.get(pdu[0], len(pdu)), modbus.reply_layout(pdu)
@@ -127,14 +127,14 @@ def _rtu_call(session: "ModbusSession", pdu: bytes) -> Call:
         if adu.startswith(request if lacking else request[: len(adu)]):
             raise CorruptError(ECHOED)
         if lacking:
-            raise IncompleteError(f"{lacking} more bytes belong to the reply")
+            raise IncompleteError(f"{lacking} bytes of the reply are missing")
         return session.read_data(request[1:-2], modbus.rtu_pdu(adu, unit))
 
     return call
 
 
 def _rtu_missing(usual: int, received: Bytes) -> int:
-    """Return the number of bytes missing of a reply that has ``usual`` bytes if it is good."""
+    """Return the number of bytes missing from a reply that normally has ``usual`` bytes."""
     size = len(received)
     if size < modbus.RTU_SHORTEST:
         return modbus.RTU_SHORTEST - size
@@ -252,11 +252,11 @@ class ModbusSession(SteppedSession):
         return bytes([data[0] & 1]) if register.type == "bit" else data
 
     def write_bytes(self, register: Register, data: bytes) -> None:
-        """Write what :meth:`read_bytes` returns."""
+        """Write data in the form that :meth:`read_bytes` returns."""
         self.prepare(write_request(self.profile, register, data))()
 
     def held_data(self, output: ModbusOutput) -> bytes | None:
-        """Return the register bytes that write what an output holds; None if not known."""
+        """Return the register bytes that rewrite the present output; None if unknown."""
         register = output.readback_register
         if register is None:
             return None
@@ -294,7 +294,8 @@ class ModbusSession(SteppedSession):
         if isinstance(step, EnsureStep) or getattr(step, "verify", False):
             found = self.read_bytes(step)
             if found != wanted:
-                raise DeviceError(f"{step.value} was written, but {_decoded(step, found):g} stands")
+                got = f"{_decoded(step, found):g} was read back"
+                raise DeviceError(f"{step.value} was written, but {got}")
 
     def would_change(self, steps: Sequence[ModbusStep]) -> bool:
         """Return whether an ensure step among these would write."""
@@ -304,7 +305,7 @@ class ModbusSession(SteppedSession):
         )
 
     def identify(self) -> None:
-        """Raise DeviceError if the register of known content holds something else."""
+        """Raise DeviceError if the self-test register does not have its known content."""
         test = self.profile.selftest
         if test == "none":
             return
@@ -357,7 +358,7 @@ class ModbusSession(SteppedSession):
         return any(self.read_bytes(source))
 
     def old_errors(self) -> list[str]:
-        """Return the content of the error register if it is not 0, which reading it may clear."""
+        """Return the content of the error register if it is not 0; reading may clear it."""
         try:
             if (check := self.error_check()) is not None:
                 check()

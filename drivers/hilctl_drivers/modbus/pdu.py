@@ -168,7 +168,7 @@ def tcp_pdu(adu: Bytes, transaction: int, unit: int) -> bytes:
 
     Raises:
         IncompleteError: More bytes belong to it.
-        CorruptError: Not Modbus, an impossible length, or bytes behind its end.
+        CorruptError: Not Modbus, an impossible length, or bytes after its end.
         MismatchError: Another transaction or unit.
     """
     if len(adu) < TCP_HEAD:
@@ -179,7 +179,7 @@ def tcp_pdu(adu: Bytes, transaction: int, unit: int) -> bytes:
     if len(adu) < length + 6:
         raise IncompleteError(f"{len(adu)} of {length + 6} bytes")
     if len(adu) > length + 6:
-        raise CorruptError(f"{len(adu) - length - 6} bytes behind the end of the reply")
+        raise CorruptError(f"{len(adu) - length - 6} bytes after the end of the reply")
     if got_transaction != transaction:
         raise MismatchError(f"transaction must be {transaction}, got {got_transaction}")
     if got_unit != unit:

@@ -37,7 +37,7 @@ _Permute: TypeAlias = Callable[[Bytes], tuple[int, ...]]
 
 @dataclass(frozen=True)
 class RegisterFormat:
-    """Encoding of one value in its registers; what is not valid raises BadRequestError."""
+    """Encoding of one value in its registers; invalid values raise BadRequestError."""
 
     type: RegisterType  # number type of the raw value
     order: str = ""  # byte order in ABCD notation; empty for most significant byte first
@@ -293,7 +293,7 @@ ModbusStep: TypeAlias = Annotated[
 
 
 class StatusRegister(Register):
-    """A register of which the bits in ``mask`` count."""
+    """A register in which only the bits of ``mask`` are significant."""
 
     mask: int = Field(ge=1, le=0xFFFFFFFF, description="bits of the raw value that count")
 

@@ -69,7 +69,7 @@ class RegisterWatchdog(HostWatchdog):
         value = self._trip_value(has)
         if value is None:
             raise DeviceError(
-                "its watchdog has tripped, and where that has put the output is not known: "
+                "its watchdog has tripped and the output is unknown: "
                 "'hilctl safe' puts it at the safe value and clears the trip"
             )
         data = output.format.encode(value)
@@ -80,7 +80,7 @@ class RegisterWatchdog(HostWatchdog):
         if has.tripped != "none":
             return session.is_set(has.tripped)
         held = session.held_data(output) if has.refuses_while_tripped else None
-        try:  # what it holds already moves nothing
+        try:  # writing the present value moves nothing
             if held is not None:
                 session.write_bytes(output, held)
         except RefusedError:
@@ -88,7 +88,7 @@ class RegisterWatchdog(HostWatchdog):
         return False
 
     def _trip_value(self, has: ModbusWatchdog) -> float | None:
-        """Return what a tripped device outputs, in the output's unit; None if not known."""
+        """Return the output of a tripped device, in the output's unit; None if unknown."""
         output, wanted = self._target, self._options.watchdog
         for step in has.safe.get(self._options.output, ()):
             if isinstance(step, RegisterStep) and step.value == "safe":

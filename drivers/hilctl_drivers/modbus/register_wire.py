@@ -52,7 +52,7 @@ class RegisterWire(Wire):
         self.watchdog: RegisterWatchdog = RegisterWatchdog(setup, session)
         readback = target.readback_register
         if readback is None and target.function == 6 and setup.writer.framing == "rtu":
-            # The correct reply equals the request, and is what a line that echoes gives.
+            # The correct reply equals the request, as does an echo on the line.
             self.unconfirmed = (
                 "the device cannot confirm it: on a serial line the reply to function 6 may be an "
                 "echo, and the output cannot be read back"
@@ -121,7 +121,7 @@ class RegisterWire(Wire):
     def _find_swap(self, reader: SensorReader) -> tuple[Swap, bool]:
         """Return how a sample is exchanged, and whether that is one transaction.
 
-        One transaction is tried by writing what the output holds already.
+        The test of one transaction writes the present output again.
         """
         session = self.session
         swap = self._combined()
@@ -144,11 +144,11 @@ class RegisterWire(Wire):
         return pair, False
 
     def _checked(self, swap: Swap) -> Swap:
-        """Return ``swap`` with a look at the error register, if there is one, after the write."""
+        """Return ``swap`` followed by a check of the error register, if there is one."""
         check = self.session.error_check()
         if check is None:
             return swap
-        check()  # a refused init step, or an error of before that only an init step clears
+        check()  # a refused init step, or an earlier error that only an init step clears
 
         def checked(data: bytes) -> float:
             found = swap(data)
@@ -214,5 +214,5 @@ class RegisterWire(Wire):
         self.session.write_bytes(self._target, data)
 
     def _read_back(self) -> float | None:
-        """Return the value of the output after a safe value; None if it cannot be known."""
+        """Return the value of the output after a safe value; None if unknown."""
         return self.read()

@@ -19,7 +19,7 @@ class BlockParser:
     Attributes:
         value: The newest value in the input's unit; NaN if it is invalid or none has arrived.
         values: Number of values since the beginning.
-        lost: Number of frames that did not arrive, according to the counter.
+        lost: Number of lost frames, according to the counter.
     """
 
     def __init__(self, profile: StreamProfile, source: StreamInput) -> None:
@@ -40,7 +40,7 @@ class BlockParser:
         self.values = self.lost = 0
 
     def feed(self, data: bytes) -> bool:
-        """Take received bytes; return whether they complete a frame.
+        """Process received bytes; return whether they complete a frame.
 
         Raise CorruptError if a block does not begin as in the profile, or has no such input.
         """

@@ -13,7 +13,7 @@ _DRAWN = 256
 
 
 class SensorNoise:
-    """Noise of a sensor's readings, the same however it is divided into blocks."""
+    """Noise of a sensor's readings, independent of the division into blocks."""
 
     def __init__(self, std_um: float, seed: int) -> None:
         self._std_um, self._seed = std_um, seed
@@ -21,7 +21,7 @@ class SensorNoise:
         self.reset()
 
     def reset(self) -> None:
-        """Start again with the first value."""
+        """Restart with the first value."""
         self._generator = np.random.Generator(np.random.PCG64(self._seed))
         self._at = self._stop = 0
 
@@ -46,8 +46,8 @@ class Plant(ABC):
     """A simulated actuator with its amplifier and sensor, advanced sample by sample.
 
     A reading is taken at the instant its command is output and cannot show that command's effect;
-    the DAC then holds the command for one sample period. The readings are the same bit for bit
-    wherever blocks are cut, noise included.
+    the DAC then holds the command for one sample period. The readings, including noise, have the
+    same bits for any division into blocks.
     """
 
     def __init__(self, noise_um: float, seed: int, chunk: int = CHUNK) -> None:
@@ -58,7 +58,7 @@ class Plant(ABC):
         self._block = tuple(self._arrays)
 
     def reset(self) -> None:
-        """Go back to rest, with the noise from its start."""
+        """Return to rest and restart the noise."""
         self._noise.reset()
         self._rest()
 
@@ -85,7 +85,7 @@ class Plant(ABC):
         displacement_um[:], measured[:] = read_um, read
 
     def warm_up(self) -> None:
-        """Advance by one sample and go back to rest, so that everything is compiled."""
+        """Advance by one sample and return to rest, so that all kernels are compiled."""
         self.reset()
         self.hold(1, 0.0)
         self.reset()
@@ -100,7 +100,7 @@ class Plant(ABC):
 
     @abstractmethod
     def _rest(self) -> None:
-        """Put the state back to rest."""
+        """Reset the state to rest."""
 
     @abstractmethod
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
@@ -120,15 +120,15 @@ class Rods:
     """Rods in a coil: current in, displacement without structure or load out.
 
     Attributes:
-        rest: Goes to the state in which only the bias has ever been there, and returns its
-            displacement, um; to be called first.
+        rest: Sets the state after the bias alone and returns its displacement in um; to be called
+            first.
         state: Array that the kernel updates.
     """
 
     def __init__(
         self, rest: Callable[[], float], kernel: Callable[..., object], state: F64, *more: object
     ) -> None:
-        """Take the kernel that does :meth:`follow`, and its arguments after those of that."""
+        """Store the kernel of :meth:`follow` and its further arguments."""
         self.rest, self.state = rest, state
         self._kernel, self._arguments = kernel, (state, *more)
 

@@ -1,8 +1,7 @@
 """Simulated rigs as devices: ``simulated_terfenol`` and ``simulated_piezo``.
 
-Time passes only in an exchange, one sample period per command, so a run needs no real time. From
-outside that is a device with a sample clock and a FIFO of its own, so they are described as
-buffered.
+Time passes only in an exchange, one sample period per command, so a run needs no real time. Seen
+from the run this is a device with its own sample clock and FIFO, so it is described as buffered.
 """
 
 import math
@@ -163,7 +162,7 @@ class SimulatedDevice(DacDevice):
         self._last_command = command.item(-1)
 
     def _put_out(self, command: float) -> None:
-        """Put the output there; an injected fault does not prevent it."""
+        """Set the output; an injected fault does not prevent it."""
         self._last_command = command
 
     def _set_digital(self, high: bool) -> None:
@@ -175,7 +174,7 @@ class SimulatedDevice(DacDevice):
         return self._digital_readings > self._rate_hz
 
     def _close(self) -> None:
-        """There is nothing to disarm."""
+        """Do nothing: there is nothing to disarm."""
 
     def _release(self) -> None:
         self._plant = None
@@ -191,7 +190,7 @@ class SimulatedDevice(DacDevice):
             super()._check_sizes(command, displacement_um, measured)
 
     def _spoil(self, fault: SimulatedFault, first_sample: int, displacement_um: F64) -> None:
-        """Put an injected sensor fault on the readings it has reached."""
+        """Apply an injected sensor fault to the readings from its sample on."""
         if first_sample + displacement_um.size <= fault.at_sample:
             return
         start = max(0, fault.at_sample - first_sample)
@@ -342,7 +341,7 @@ class TerfenolOptions(SimulatedOptions):
 
     @property
     def command_range_a(self) -> tuple[float, float]:
-        """Lowest and highest command: with the bias it must stay within ``current_max_a``."""
+        """Lowest and highest command: including the bias it must stay within ``current_max_a``."""
         dac_a = TerfenolParameters().dac_range_a / self._turns
         most_a = dac_a if self.current_max_a is None else self.current_max_a
         low, high = -most_a - self.bias_a, most_a - self.bias_a

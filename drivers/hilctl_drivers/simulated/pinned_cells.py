@@ -4,8 +4,8 @@ The pinned cells follow A. Bergqvist, "Magnetic vector hysteresis model with dry
 pinning", Physica B 233 (1997) 342, and F. Henrotte et al., "An energy-based vector hysteresis model
 for ferromagnetic materials", COMPEL 25 (2006) 71. Lag, cells and strain were fitted to the figures
 given with the loops of the dissertation (see ``terfenol.py``), minor loops among them (figures 2.7
-to 2.14, 4.2, 5.5 and 6.3): all agree within 7.1 % but the asymmetry at 3 A, which is 10.4 % of the
-stroke instead of 6.4 %. Fields are in A/m, displacements in um, times in s.
+to 2.14, 4.2, 5.5 and 6.3): all agree within 7.1 % except the asymmetry at 3 A, which is 10.4 % of
+the stroke instead of 6.4 %. Fields are in A/m, displacements in um, times in s.
 """
 
 import math
@@ -69,7 +69,7 @@ class PinnedCellsParameters(RodParameters):
 
 @kernel()
 def _langevin(x: float) -> float:
-    """Return L(x) = coth x - 1/x; by its series near 0, where the difference cancels."""
+    """Return L(x) = coth x - 1/x; by its series near 0, because the difference cancels there."""
     size = abs(x)
     if size < 0.02:
         square = x * x
@@ -80,7 +80,7 @@ def _langevin(x: float) -> float:
 
 @kernel()
 def _field_rate(behind: float, lag: float, growth: float) -> float:
-    """Return dH/dt where the field is ``behind`` its drive: slower the further behind it is."""
+    """Return dH/dt of a field that lags its drive by ``behind``: slower for a larger lag."""
     return behind / (lag * (1.0 + growth * abs(behind)))
 
 

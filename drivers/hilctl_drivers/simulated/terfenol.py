@@ -2,9 +2,9 @@
 
 Amplifier, rods, structure and sensor are chained as in the rig of the dissertation "Modeling and
 Compensation of Rate-Dependent Asymmetric Hysteresis Nonlinearities of Magnetostrictive Actuators",
-Concordia, sections 3.3 and 3.4 of its chapter 2. The physics of the rods (``Rods``) is near to what
-a compensator inverts: pinned magnetisation after a non-linear lag of the field, where that has
-plays of the current.
+Concordia, sections 3.3 and 3.4 of its chapter 2. The physics of the rods (``Rods``) is similar to
+the model of a compensator, but has pinned magnetisation after a non-linear lag of the field instead
+of plays of the current.
 """
 
 import math
@@ -292,10 +292,10 @@ class TerfenolActuator(Plant):
         self._samples = 0
 
     def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
-        """Pass some samples through amplifier, rods and structure, one after the other.
+        """Pass samples through amplifier, rods and structure in turn.
 
-        The rods do not act back on the amplifier, nor the structure on the rods; so each may take
-        all the steps together. The structure is not affected by drift and thermal growth.
+        The rods have no effect on the amplifier, nor the structure on the rods, so each can process
+        all steps together. The structure is not affected by drift and thermal growth.
         """
         drift_um, per_sample = self._drift
         if drift_um:

@@ -3,11 +3,11 @@
 Names follow the "Catalogue of parametrised CRC algorithms": CRC-16/MODBUS, CRC-16/IBM-3740 (also
 called CCITT-FALSE), CRC-16/XMODEM, CRC-32/ISO-HDLC.
 
-All see any three flipped bits in messages of the sizes used here. Of bursts, in the order in which
-a serial port sends bits, crc16_modbus sees all up to 16 bits and crc32 up to 32; the CCITT ones,
-whose bits run the other way, up to 14. Random rubbish passes a 16-bit CRC once in 65536.
-crc16_xmodem starts at 0 and so does not see zeros lost or added at a message's beginning: check the
-size of what it lets pass.
+All detect any three flipped bits in messages of the sizes used here. Of bursts, in the bit order of
+a serial port, crc16_modbus detects all up to 16 bits and crc32 up to 32; the CCITT ones, with the
+opposite bit order, up to 14. Random data passes a 16-bit CRC once in 65536. crc16_xmodem starts at
+0 and therefore does not detect zeros lost or added at the beginning of a message: check the size
+too.
 """
 
 import zlib
@@ -44,7 +44,7 @@ class Crc:
 
 
 def _modbus_table(bits: int) -> "array[int]":
-    """Return what ``bits`` bits at once do to the CRC: uint16[2**bits], of CRC xor bits."""
+    """Return the effect of ``bits`` bits on the CRC: uint16[2**bits], of CRC xor bits."""
     values = np.arange(1 << bits)
     for _ in range(bits):
         values = values >> 1 ^ np.where(values & 1, 0xA001, 0)

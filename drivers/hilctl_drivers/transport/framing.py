@@ -4,7 +4,7 @@ COBS frame: ``COBS(payload | crc LE) 00``. Length-prefixed frame: ``length u16 L
 LE``, the length counting the payload alone, the CRC over length and payload. COBS: Cheshire and
 Baker, "Consistent Overhead Byte Stuffing", IEEE/ACM Transactions on Networking 7(2), 1999.
 
-In a stream the next message is found again after damaged bytes.
+In a stream the next message after damaged bytes is found.
 """
 
 from abc import ABC, abstractmethod
@@ -40,7 +40,7 @@ def split_sized(
 ) -> Iterator[Content]:
     """Remove the frames from a stream, each with a known size; yield the good ones.
 
-    After a bad frame every byte is tried as a beginning until a frame's check passes.
+    After an invalid frame, every byte is tried as a start until a check passes.
 
     Args:
         received: The stream; an incomplete frame stays in it.
@@ -93,11 +93,11 @@ class Framing(ABC):
         if not size or len(frame) < size:
             raise IncompleteError(f"{len(frame)} bytes of a frame")
         if len(frame) > size:
-            raise CorruptError(f"{len(frame) - size} bytes behind the end of the frame")
+            raise CorruptError(f"{len(frame) - size} bytes after the end of the frame")
         return self._payload(bytes(frame))
 
     def missing(self, received: bytearray) -> int:
-        """Return how many bytes a frame has at least after the received ones; 0 if it is whole."""
+        """Return the least number of missing bytes of a frame; 0 if it is complete."""
         size = self._size_of(received)
         return max(0, size - len(received)) if size else 1
 

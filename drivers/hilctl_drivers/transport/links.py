@@ -65,7 +65,7 @@ class Link(Protocol):
         """
 
     def doubt(self) -> None:
-        """Note a failure: what an older request can still cause must not affect the next one."""
+        """Note a failure: late effects of an older request must not affect the next one."""
 
     def close(self) -> None:
         """Close the link; closing twice is fine."""
@@ -81,7 +81,7 @@ class ErrorPrefix:
         """Enter it."""
 
     def __exit__(self, _kind: object, error: BaseException | None, _trace: object) -> None:
-        """Raise DeviceError in place of one without the name."""
+        """Replace a DeviceError by one with the name."""
         if self._who and isinstance(error, DeviceError):
             raise DeviceError(f"{self._who}: {error}") from None
 
@@ -95,7 +95,7 @@ def why(error: OSError, remedies: Mapping[int, str] = MappingProxyType({})) -> s
 def wait_ms(deadline: float, now: float) -> int:
     """Return the longest wait for the rest of a reply, in ms: 0 after the deadline.
 
-    A link then still reads once what has arrived, because the host may have stalled meanwhile.
+    A link then still reads received bytes once, because the host may have stalled meanwhile.
     """
     return max(0, math.ceil((deadline - now) * 1e3))
 
@@ -107,7 +107,7 @@ def cut(got: int, wanted: int, timeout_s: float) -> str:
 
 
 class FrameError(DeviceError):
-    """A message cannot be built, or what came back is not a good answer to it."""
+    """A message cannot be built, or its reply is invalid."""
 
 
 class BadRequestError(FrameError, ValueError):

@@ -1,4 +1,4 @@
-"""Identity of a serial port: the device that its path led to first.
+"""Identity of a serial port: the device to which its path first led.
 
 A path such as ``/dev/ttyUSB0``, or a link, leads to another device once the first is unplugged. A
 process that retries the safe value must not send it there.
@@ -15,7 +15,7 @@ PTY_MAJORS = range(136, 144)
 
 
 class PortIdentity:
-    """The device that a port's path led to when it was first there.
+    """The device to which a port's path led when the device first existed.
 
     A USB adapter is known by :func:`usb_adapter`, any other port by its device number. The number
     of a closed pseudo-terminal is used again, so its file is kept too. Owner, mode and times, which
@@ -25,7 +25,7 @@ class PortIdentity:
     def __init__(self, path: str) -> None:
         self._path = path
         self.known = ""
-        """The device; empty before one was there."""
+        """The device; empty before one existed."""
         self._pty = -1
         with suppress(OSError):
             self.device_file()
@@ -35,7 +35,7 @@ class PortIdentity:
 
         Raises:
             OSError: There is none.
-            LostError: It leads to another device than the first time.
+            LostError: It leads to a different device than the first time.
         """
         file = os.path.realpath(self._path)
         device = Path(file).stat().st_rdev
@@ -59,8 +59,8 @@ class PortIdentity:
 def usb_adapter(device: int, sysfs: Path = Path("/sys")) -> str:
     """Return the identity of the USB adapter that has a device number; empty if there is none.
 
-    It begins with ``usb:``, vendor, product and serial number, or with ``socket:`` and its place if
-    it has no number, and ends with the port of several.
+    It begins with ``usb:``, vendor, product and serial number, or with ``socket:`` and its USB port
+    if it has no number. An adapter with several ports adds the port.
     """
     number = f"{os.major(device)}:{os.minor(device)}"
     port = (sysfs / "dev" / "char" / number / "device").resolve()

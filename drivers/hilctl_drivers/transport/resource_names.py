@@ -9,9 +9,9 @@ process:
 - on a real port that no other program has open, as far as this process can see;
 - on a pseudo-terminal, which its far end keeps, only if this process could open it all the same.
 
-Between experiments one device is one lock, see :attr:`hilctl.base.device.DeviceInfo.holds`. So each
-place has all the names that another experiment could use: a port its path, the target of its links
-and its device number, a host its name and its addresses.
+Between experiments one device is one lock, see :attr:`hilctl.base.device.DeviceInfo.holds`.
+Therefore each address has all names that another experiment could use: a port its path, the target
+of its links and its device number, a host its name and its addresses.
 """
 
 import ipaddress
@@ -87,7 +87,7 @@ _LOOPBACK = "127.0.0.1"
 
 
 def held_port(path: str) -> tuple[str, ...]:
-    """Return the names of a serial port; one that is not there has that of its file alone."""
+    """Return the names of a serial port; a missing port has only the name of its file."""
     real = Path(path).resolve()
     # The path as it was given too: a link of udev is gone with its device, and what still waits
     # for that must be found.

@@ -17,11 +17,11 @@ for 16 ms, and some devices think as long."""
 
 
 class SafeExchange:
-    """Attempts that send a value first, and then have it confirmed.
+    """Attempts that first send a value and then request its confirmation.
 
     Serial protocols do not number their replies, or repeat the numbers: after a failure the answer
-    to an older message would pass for the next one's, and so on. The silence that is required grows
-    with each failed attempt, up to the timeout.
+    to an older message would be taken for the answer to the next one, and so on. The silence that
+    is required grows with each failed attempt, up to the timeout.
     """
 
     def __init__(self) -> None:
@@ -30,7 +30,7 @@ class SafeExchange:
     def attempt(
         self, link: StreamLink, send: Callable[[], None], confirm: Callable[[], None]
     ) -> None:
-        """Send the value and have it confirmed, once.
+        """Send the value and request its confirmation, once.
 
         Args:
             link: To the device, open or not; a board that opening resets is not waited for.
@@ -61,7 +61,7 @@ class SafeExchange:
 
 
 def try_out(output: Range, held: float, put: Callable[[], None], how: str) -> None:
-    """Write what an output holds, with the message that writes the safe value; nothing moves.
+    """Write the present output with the message that writes the safe value; nothing moves.
 
     An output that is out of range is left alone. ``how`` names register or message in errors.
     """
@@ -74,6 +74,6 @@ def try_out(output: Range, held: float, put: Callable[[], None], how: str) -> No
 
 
 def check_read_back(output: Range, wanted: float, found: float, tolerance: float) -> None:
-    """Raise DeviceError unless an output holds what was written, within a tolerance."""
+    """Raise DeviceError unless an output has the written value, within a tolerance."""
     if not abs(found - wanted) <= tolerance:
         raise DeviceError(f"{wanted:g} {output.unit} was written, but {found:g} was read back")

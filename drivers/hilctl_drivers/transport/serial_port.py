@@ -61,7 +61,7 @@ def _open_port(path: str, settings: SerialLineSettings) -> serial.Serial:
 def _open_again(path: str, settings: SerialLineSettings) -> _Port:
     """Open a port of a run for the safe value.
 
-    pyserial takes five descriptors. If this process lacks them, one must do, without a lock: the
+    pyserial takes five descriptors. If this process lacks them, one is used without a lock; the
     system keeps the settings of a port.
     """
     try:
@@ -90,7 +90,7 @@ def _keep_levels(fd: int) -> None:
 
 
 class SerialLink(StreamLink):
-    """A serial port with exclusive access, for the device that was there first."""
+    """A serial port with exclusive access to the device that it first led to."""
 
     LOST = "port lost, unplugged?"
 
@@ -147,7 +147,7 @@ class SerialLink(StreamLink):
         if dict(self._poll.poll(0)).get(self._fd, 0) & ~select.POLLIN:
             raise OSError(errno.EIO, os.strerror(errno.EIO))
         raise DeviceError(
-            "bytes came and were gone before they could be read: another program reads this port "
+            "received bytes disappeared before they were read: another program reads this port "
             "(lsof names it; ModemManager, brltty and terminal programs do)"
         )
 

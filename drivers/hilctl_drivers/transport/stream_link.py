@@ -41,7 +41,7 @@ def _counts_waiting(fd: int, waiting: "array.array[int]") -> Callable[[], object
 
 
 def _behind(request: bytes | bytearray, missing: Missing) -> Missing:
-    """Return ``missing`` for replies behind an echo of the request."""
+    """Return ``missing`` for replies after an echo of the request."""
     size = len(request)
 
     def counted(got: bytearray) -> int:
@@ -124,7 +124,7 @@ class StreamLink(ABC):
     ) -> bytes | bytearray:
         """Exchange, see :meth:`~hilctl_drivers.transport.links.Link.transact`.
 
-        After a failure the next request waits until the line is quiet and discards what came.
+        After a failure the next request waits until the line is quiet and discards received bytes.
         """
         if self._fd < 0:
             raise LostError("not open")
@@ -158,9 +158,9 @@ class StreamLink(ABC):
         return reply[len(request) :] if self._echo else reply
 
     def send_now(self, request: bytes | bytearray) -> None:
-        """Send ``request`` whatever is on the line, and await no answer.
+        """Send ``request`` regardless of bytes on the line, without waiting for a reply.
 
-        The next exchange discards what comes meanwhile.
+        The next exchange discards bytes received meanwhile.
         """
         if self._fd < 0:
             raise LostError("not open")
@@ -168,7 +168,7 @@ class StreamLink(ABC):
         try:
             self._send(request)
         except NoAnswerError:
-            # What waits there would be executed before the next try, or hold it up for good.
+            # Unsent bytes would be executed before the next attempt, or block it permanently.
             self._discard_unsent()
             raise
         except OSError as error:

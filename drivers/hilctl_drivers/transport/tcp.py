@@ -66,14 +66,14 @@ class _Connection:
             self._socket = None
 
     def _reset(self) -> None:
-        """Break the connection: what the peer has not been given yet must not reach it later."""
+        """Reset the connection, so that undelivered data cannot reach the peer later."""
         if self._socket is not None:
             self._socket.setsockopt(socket.SOL_SOCKET, socket.SO_LINGER, struct.pack("ii", 1, 0))
         _Connection.close(self)
 
 
 class TcpLink(_Connection):
-    """A TCP connection for replies with a number, as those of Modbus TCP."""
+    """A TCP connection for numbered replies, such as those of Modbus TCP."""
 
     def __init__(
         self, host: str, port: int, timeout_s: float, clock: Callable[[], float] = time.monotonic
@@ -96,8 +96,8 @@ class TcpLink(_Connection):
     ) -> bytes | bytearray:
         """Exchange, see :meth:`~hilctl_drivers.transport.links.Link.transact`.
 
-        After a failure the connection is reset: a late reply could only be taken for that of the
-        next request, and a request that is not delivered yet must not be any more.
+        After a failure the connection is reset: a late reply could only be taken for the reply to
+        the next request, and an undelivered request must not be delivered later.
         """
         connection = self._socket
         if connection is None:
@@ -159,15 +159,15 @@ class TcpReceiver(_Connection):
             raise LostError(f"connection lost: {why(error)}") from None
 
     def wait(self, wait_s: float) -> bool:
-        """Wait until something arrives; return False if nothing has."""
+        """Wait for data; return whether any has arrived."""
         assert self._socket is not None
         return bool(select.select([self._socket], [], [], max(0.0, wait_s))[0])
 
     def receive(self) -> tuple[bytes, int]:
-        """Return what has arrived, without waiting, and the age of its last byte in ns.
+        """Return received bytes, without waiting, and the age of the last byte in ns.
 
-        The kernel tells the time of arrival. If it does not, the age is the time since the last
-        call, which also limits the effect of a change of the system's clock.
+        The kernel reports the time of arrival. Without it, the age is the time since the last call,
+        which also limits the effect of a change of the system's clock.
 
         Raises:
             LostError: The link is not open, or broke.

@@ -42,7 +42,7 @@ class WireTime:
         return self.samples / self.total_s if self.total_s > 0.0 else float("inf")
 
     def then(self, other: "WireTime | None") -> "WireTime":
-        """Return the duration of this and then ``other``, for the samples of this."""
+        """Return the duration of both in sequence, for the samples of this one."""
         if other is None:
             return self
         parts = ("request_s", "reply_s", "gaps", "gaps_s", "turnaround_s", "settle_s")

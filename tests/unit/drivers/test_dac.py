@@ -390,7 +390,7 @@ def test_nobody_there_is_said(rig):
 @pytest.mark.parametrize(("changes", "text"), [
     ({"output": "AO9"}, "output must be one that nobody DCON"),
     ({"input": "AI9"}, "input must be one that nobody DCON"),
-    ({"profile": "labjack_t7"}, "one for kind: modbus_dac"),
+    ({"profile": "labjack_t7"}, "for kind: modbus_dac"),
     ({"profile": "kepco_bop", "output": "current", "input": "current"}, "as reader"),
     ({"measure": "AI0"}, "measure must be an input of nobody .* measures its own output"),
     ({"profile": "cobs_board", "output": "DAC", "input": "ADC", "measure": "ADC"}, "measures its"),

@@ -53,9 +53,9 @@ def watchdog(**changes):
     ("none", {}, "Acme has no host watchdog: it holds its last output"),
     (watchdog(), {"timeout_s": 20.0}, "timeout_s must be 0.1 to 10"),
     (watchdog(), {"safe_command": 30.0}, "safe_command must be -20 to 20, got 30"),
-    (watchdog(safe={"A": ()}), {}, "does nothing for B, only for A: take one of these, or"),
-    (watchdog(on_trip="hold"), {}, "holds B where it is when it trips: say watchdog: none"),
-    (watchdog(on_trip="zero"), {"safe_command": 3.0}, "puts B at 0 V, which is 0 A here"),
+    (watchdog(safe={"A": ()}), {}, " B, only on A: "),
+    (watchdog(on_trip="hold"), {}, "holds the value of B .*: set watchdog: none"),
+    (watchdog(on_trip="zero"), {"safe_command": 3.0}, "B to 0 V, which is 0 A here"),
     (watchdog(on_trip="reset"), {"offset_a": 1.0}, "which is 1 A here: .* got 0"),
 ])  # fmt: skip
 def test_watchdog_that_does_not_do_what_is_asked_is_refused(has, wanted, words):

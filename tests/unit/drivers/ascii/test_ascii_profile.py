@@ -39,5 +39,5 @@ def test_a_trip_that_nobody_can_ask_about_is_not_cleared():
     """The safe value is put out with the trip's end, and must not be where there was none."""
     plain = DCON.model_dump()
     plain["watchdog"]["tripped"] = "none"
-    with pytest.raises(ValidationError, match="clear needs tripped"):
+    with pytest.raises(ValidationError, match="clear requires tripped"):
         AsciiProfile.model_validate(plain)

@@ -140,7 +140,7 @@ def test_a_state_byte_by_byte(board):
     assert board.link.asked == [b"\x16\x01"]
     assert (found.tripped, found.output, found.reading) == (True, 0.5, -2.5)
     board.link.make = answer(body=b"\x00" + struct.pack("<f", 0.5))
-    with pytest.raises(MismatchError, match="4 bytes behind"):
+    with pytest.raises(MismatchError, match="4 bytes"):
         board.state()
 
 

@@ -178,7 +178,7 @@ class Spoiled(InProcessLink):
 
 @pytest.mark.parametrize(("change", "text"), [
     (lambda r: r[:-1], "only 259 bytes"),
-    (lambda r: r + b"\0", "1 bytes behind the end"),
+    (lambda r: r + b"\0", "1 bytes"),
     (lambda r: b"\x55" + r[1:], "transaction must be"),
     (lambda r: r[:3] + b"\1" + r[4:], "not a Modbus TCP header"),
     (lambda r: r[:5] + b"\3" + r[6:7] + PATTERN, r"exception 4 \(device failure\)"),

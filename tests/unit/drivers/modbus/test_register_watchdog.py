@@ -156,7 +156,7 @@ class TestTrip:
         trip(made, 3.0)
         device = made.another(watchdog="none")
         before = made.writes()
-        with pytest.raises(DeviceError, match="not known"):
+        with pytest.raises(DeviceError, match="hilctl safe"):
             device.open(100.0, 1)
         assert made.writes() == before
         device.make_safe(0.0)

@@ -165,7 +165,7 @@ class TestExchange:
         ("tcp", "silence", "no answer within"),
         ("tcp", "corrupt", "not a Modbus TCP header"),
         ("tcp", "cut", "only 6 bytes, 2 short, within"),
-        ("tcp", "duplicate", "bytes behind the end of the reply"),
+        ("tcp", "duplicate", "bytes after the end of the reply"),
         ("tcp", "wrong_id", "transaction must be"),
         ("tcp", "reset", "connection lost"),
         ("tcp", "exception", "exception 4"),
