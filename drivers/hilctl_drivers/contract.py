@@ -31,7 +31,7 @@ STEP = 0.01
 
 @dataclass
 class DrivenDevice:
-    """A device and how to use it.
+    """A device with its parameters for the tests.
 
     ``stands`` returns its output as a command, if possible from the emulated device or the
     simulated plant; None if unknown.

@@ -72,7 +72,7 @@ class DacDevice(ABC):
 
     @property
     def info(self) -> DeviceInfo:
-        """What the device is and what it accepts."""
+        """Description of the device and its limits."""
         return self._info
 
     def check_rate(self, sample_rate_hz: float, block: int) -> None:
@@ -101,7 +101,7 @@ class DacDevice(ABC):
         except DeviceError as error:
             raise self._failed("open", error, self._release) from None
         self._block = block
-        self.transactions -= self._info.ages_readings  # no request to a sensor that sends unasked
+        self.transactions -= self._info.ages_readings  # no request: unsolicited samples
         self.transactions += bool(self._aux_readers)
         if self.transactions:
             details = {**self._info.details, "transactions": str(self.transactions)}

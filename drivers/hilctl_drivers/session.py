@@ -21,7 +21,7 @@ class Session(ABC):
     """A link to one device, with one request at a time; each protocol has its session."""
 
     AGES: ClassVar[bool] = False
-    """Whether the device sends unasked, so that its readings have an age."""
+    """Whether the device sends unsolicited samples, so that its readings have an age."""
     READS_ANY: ClassVar[bool] = True
     """Whether it can read any input of the device in a separate request."""
     age_s = math.nan

@@ -170,7 +170,7 @@ LINE = ("baud", "parity", "stopbits", "echo", "gap_s")
 PORT = ("boot_wait_s", "dtr", "rts", "rs485")
 """Settings of a serial port of this machine."""
 STREAM = ("max_age_s",)
-"""Settings of a sensor that sends unasked."""
+"""Settings of a sensor that sends unsolicited samples."""
 
 
 class AddressOptions(DeviceOptions):

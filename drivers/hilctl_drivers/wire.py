@@ -1,6 +1,6 @@
 """Parts of a :class:`~hilctl_drivers.dac.Dac` that depend on the protocol: wire and watchdog.
 
-Values are in the unit of the output or input, commands in that of the actuator. Errors are
+Values are in the unit of the output or input, commands in the unit of the actuator. Errors are
 ``DeviceError`` and name neither the device nor the action: the device adds them.
 """
 

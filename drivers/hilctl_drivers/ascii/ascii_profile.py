@@ -301,8 +301,7 @@ class AsciiOutput(ScaledRange):
     def check_field(self, key: str, template: str, field: str) -> None:
         """Raise ValueError if a field of a template overflows, or rounds by more than a step.
 
-        The text is formatted after the limiter, so a coarse format could exceed the limits of a
-        run.
+        The text is formatted after the limiter: a coarse format could exceed the limits of a run.
         """
         for limit in self.limits:
             try:

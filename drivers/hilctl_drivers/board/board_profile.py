@@ -56,7 +56,7 @@ class FrameChannel(Range):
 
     @property
     def format(self) -> RegisterFormat:
-        """How a value becomes bytes."""
+        """Encoding of a value as bytes."""
         return RegisterFormat(self.type, self.order, self.scale, self.offset)
 
 

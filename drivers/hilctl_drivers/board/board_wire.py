@@ -2,9 +2,8 @@
 
 A board with a FIFO answers a block when it has output all but ``prefill`` of the queued samples,
 and returns their readings. Its clock therefore sets the pace, and the readings of a block come
-``fifo_blocks`` exchanges after it. Between two exchanges the FIFO holds that many blocks, which is
-the longest tolerable stall of this machine. The board outputs the first sample when that many
-blocks are queued.
+``fifo_blocks`` exchanges after it. Between two exchanges the FIFO holds that many blocks, the
+longest stall of this machine. The board outputs the first sample when that many blocks are queued.
 """
 
 from typing import cast

@@ -56,13 +56,13 @@ REPLY_HEAD = Struct("<BBB")
 """Of a reply: type, seq, status. It ends there if the request was refused."""
 
 EXCHANGE_FIELDS = Struct("<H")
-"""n, both ways; after the values of a reply comes :data:`FIFO_TAIL`."""
+"""n, in request and reply; after the values of a reply follows :data:`FIFO_TAIL`."""
 STREAM_FIELDS = Struct("<IH")
-"""first, n, both ways; after the values of a reply comes :data:`FIFO_TAIL`."""
+"""first, n, in request and reply; after the values of a reply follows :data:`FIFO_TAIL`."""
 FIFO_TAIL = Struct("<HH")
 """fifo_level, underruns."""
 WATCHDOG_FIELDS = Struct("<I")
-"""timeout_ms, both ways; the safe value follows in a request."""
+"""timeout_ms, in request and reply; the safe value follows in a request."""
 INFO_REPLY = Struct("<BHHfff")
 """version, fifo_depth, block_max, rate_max_hz, min, max; the name follows."""
 CLOCK_REQUEST = Struct("<fH")

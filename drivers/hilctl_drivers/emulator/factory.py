@@ -114,7 +114,7 @@ class _Plan:
                 f"fault invalid: {self._sensor} of {reader.title} has no validity, invalid or valid"
             )
         if "stall" in faults and not isinstance(reader, StreamProfile):
-            raise InputError(f"fault stall: {reader.title} does not send unasked")
+            raise InputError(f"fault stall: {reader.title} sends no unsolicited samples")
         self._apart = reader is not profile and not self._may_share(options.reader_line)
         """Whether the reader has its own wire."""
         self.reader_unit_id = self._unit_of_reader()
@@ -194,7 +194,7 @@ class _Plan:
         return made
 
     def listen_addresses(self, addresses: list[str]) -> tuple[ListenAddress, ...]:
-        """Return where the devices are served, with their unit ids if there are two."""
+        """Return the addresses of the devices, with their unit ids if there are two."""
         options, profile = self._options, self._profile
         if options.reader is None:
             return (ListenAddress(options.profile, addresses[0], None),)

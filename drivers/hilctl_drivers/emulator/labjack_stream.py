@@ -24,7 +24,7 @@ _NOMINAL: dict[str, tuple[float, ...]] = {
     "two_slopes": (0.000315805780, -0.000315805800, 33523.0, -10.586956522),
     "line": (3.235316e-04, -10.532965) * 4,
 }
-"""Nominal calibration constants (T-Series Datasheet 20.0.1; 20.0.0, those of AIN0 for all)."""
+"""Nominal calibration constants (T-Series Datasheet 20.0.1; 20.0.0, AIN0 constants for all)."""
 
 
 class LabJackInput:

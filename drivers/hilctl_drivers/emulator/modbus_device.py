@@ -73,7 +73,7 @@ class EmulatedWatchdog(WatchdogTimer):
 
 
 def _last(steps: tuple[ModbusStep, ...], words: dict[int, Words]) -> Target | None:
-    """Return what the last writing step writes."""
+    """Return the write of the last step that writes."""
     for step in reversed(steps):
         if isinstance(step, WriteStep | EnsureStep):
             found = words[id(step)]

@@ -92,7 +92,7 @@ ReaderLine: TypeAlias = Literal["same", "own"]
 
 @dataclass(frozen=True)
 class EmulatorOptions:
-    """What to emulate; initial command, and unit of the reader: Modbus only."""
+    """Options of an emulator; initial command and unit of the reader are for Modbus only."""
 
     profile: str  # name of a shipped profile, or path of one
     link: LinkKind | None = None  # of both devices; the profiles' own if None

@@ -26,7 +26,7 @@ class Words:
         self.data = bytes(2 * register.words)
 
     def encoded(self, value: float) -> bytes:
-        """Return the words that stand for ``value``, as bytes."""
+        """Return the words that encode ``value``, as bytes."""
         return bytes((0, value != 0.0)) if self._format is None else self._format.encode(value)
 
     def set_bits(self, mask: int, bits: int) -> None:
@@ -36,7 +36,7 @@ class Words:
 
     @property
     def value(self) -> float:
-        """The value that the words stand for."""
+        """The value that the words encode."""
         return float(self.data[1]) if self._format is None else self._format.decode(self.data)
 
     @value.setter
@@ -58,8 +58,7 @@ def _find(places: _Map, areas: Sequence[str], address: int) -> tuple[Words, int]
 class RegisterMap:
     """Registers that a profile names, with the values it expects; ``steps`` is by their ``id``.
 
-    There are separate maps for reading and writing, because an address of a coupler can have a
-    different meaning in each.
+    Reads and writes have separate maps, because couplers use an address for different things.
     """
 
     def __init__(self, profile: ModbusProfile) -> None:
@@ -84,7 +83,7 @@ class RegisterMap:
         return b"".join(words.data[2 * k : 2 * k + 2] for words, k in found)
 
     def targets(self, area: str, address: int, data: bytes) -> list[tuple[Words, bytes]]:
-        """Return which values a write would change, and to which words; no part of a value."""
+        """Return the values that a write would change, with their new words; never part of one."""
         found: list[tuple[Words, bytes]] = []
         while data:
             words, k = _find(self._writable, [area], address)

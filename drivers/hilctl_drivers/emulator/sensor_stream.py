@@ -1,4 +1,4 @@
-"""An emulated sensor that sends samples unasked: a profile's blocks in front of the rig."""
+"""An emulated sensor with unsolicited samples: a profile's blocks in front of the rig."""
 
 from hilctl_drivers.emulator.rig import Bench, EmulatedDevice
 from hilctl_drivers.emulator.wire import EmulatedWire

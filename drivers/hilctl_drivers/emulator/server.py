@@ -112,7 +112,7 @@ class _Scheduled(NamedTuple):
 
 
 _TICK_S = 0.005
-_STALE_NS = 1_000_000_000  # a busy machine may pass on in parts what was written at once
+_STALE_NS = 1_000_000_000  # a busy machine may deliver one write in parts
 
 
 class EmulatorServer:

@@ -101,7 +101,7 @@ class EmulatedText(SerialDevice):
         return EmulatedReply(None)
 
     def wrong_id(self, reply: bytes) -> bytes:
-        """Return a reply from another address, or to another question if it has no address."""
+        """Return a reply from another address, or to another query if it has no address."""
         if isinstance(self.profile.link, BytesLink):
             return b"FF" + reply[2:]
         own = f"{self._address:02X}".encode()

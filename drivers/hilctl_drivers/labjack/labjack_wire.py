@@ -157,7 +157,7 @@ class StreamSession:
             # A device that still has readings is in time: the host has stalled.
             if self._waiting < count and not self._backlog and self.clock() > deadline:
                 late = f"{self._waiting} of {count} readings within {self._timeout_s:g} s"
-                raise DeviceError(f"the device's clock stands: {late} of when they were due")
+                raise DeviceError(f"the device's clock has stopped: {late} of the due time")
         readings = np.concatenate(self._parts)
         self._parts[:] = [readings[count:]]
         self._waiting -= count

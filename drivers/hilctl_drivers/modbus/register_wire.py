@@ -119,7 +119,7 @@ class RegisterWire(Wire):
         super().release()
 
     def _find_swap(self, reader: SensorReader) -> tuple[Swap, bool]:
-        """Return how a sample is exchanged, and whether that is one transaction.
+        """Return the exchange of a sample, and whether it is one transaction.
 
         The test of one transaction writes the present output again.
         """

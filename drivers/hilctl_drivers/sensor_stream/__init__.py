@@ -1,1 +1,1 @@
-"""Sensors that send samples unasked over TCP: profile, session that takes the newest."""
+"""Sensors that send unsolicited samples over TCP: profile and session."""

@@ -1,4 +1,4 @@
-"""Profiles of sensors that send samples unasked over TCP.
+"""Profiles of sensors that send unsolicited samples over TCP.
 
 A stream consists of blocks: a header, then frames with one value per channel. Positions count bytes
 from 0. Byte order is in ABCD notation, see :mod:`hilctl_drivers.modbus.register_map`.
@@ -74,7 +74,7 @@ class StreamInput(FrameChannel):
 
 
 class StreamProfile(BaseProfile):
-    """A sensor that sends samples unasked."""
+    """A sensor that sends unsolicited samples."""
 
     DEVICE: ClassVar[str] = "serial_dac"
     SESSION: ClassVar[str] = "hilctl_drivers.sensor_stream.stream_session:SensorStreamSession"

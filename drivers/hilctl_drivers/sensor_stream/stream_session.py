@@ -1,4 +1,4 @@
-"""Session that reads the newest sample of a sensor that sends unasked."""
+"""Session that reads the newest sample of a sensor with unsolicited samples."""
 
 import math
 import time

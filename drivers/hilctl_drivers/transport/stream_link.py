@@ -203,7 +203,7 @@ class StreamLink(ABC):
         return LostError(f"{self.LOST} {why(error)}")
 
     def _settle(self) -> None:
-        """Wait until the next request may be sent; raise DeviceError for unasked bytes."""
+        """Wait until the next request may be sent; raise DeviceError for unsolicited bytes."""
         if self._stale:
             self.drain()
             self._count_waiting()

@@ -17,7 +17,7 @@ _FIRST = 256
 than the system's."""
 _CHUNK = 4096
 _RECEIVED, _MOST_CHUNKS = 65536, 64
-"""Bytes of one read of unasked data, and reads at a time."""
+"""Bytes of one read of unsolicited data, and reads at a time."""
 _SO_TIMESTAMPNS = 35
 """Option of Linux that Python does not name: the kernel's time of arrival with the data."""
 _TIMESPEC = struct.Struct("@ll")
