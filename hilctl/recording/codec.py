@@ -35,8 +35,7 @@ class BlockArrays:
         columns: float64[n] by name of their field; empty ones are omitted.
         state: float64[s], the compensator's memory before the block; usually empty.
         previous_command: float64[1] or empty: the command before the block.
-        aux: float64[exchanges * channels], the auxiliary channels of each exchange; empty without
-            channels.
+        aux: float64[exchanges * channels], auxiliary channels of each exchange; may be empty.
     """
 
     tick0: int

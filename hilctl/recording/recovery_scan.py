@@ -259,7 +259,7 @@ class RecoveryScan:
         if not self.damages:
             return "its end and index are missing"
         if not serious:
-            return "its index is damaged or cut"
+            return "its index is damaged or truncated"
         more = f" and {len(serious) - 2} more" if len(serious) > 2 else ""
         wrong = "; any fact in it may be wrong" if any(each.lasting for each in serious) else ""
         return ", ".join(str(damage) for damage in serious[:2]) + more + wrong

@@ -117,8 +117,7 @@ def _first_at_or_after(t_s: float, rate_hz: float) -> int:
 def places_of(stream: BinaryIO, time_range: TimeRange) -> list[int] | None:
     """Return the sorted offsets of the records of a time range; None without a valid index.
 
-    These are chunks with samples or ticks in the range, chunks with events, and all metadata and
-    attachments.
+    These are chunks with its samples or ticks, or with events, and all metadata and attachments.
     """
     summary = _summary(stream)
     chunks = [record for record in summary if isinstance(record, ChunkIndex)]

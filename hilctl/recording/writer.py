@@ -88,7 +88,7 @@ class RecordingWriter:
         self._writer.flush()
 
     def finish(self, end: Mapping[str, str], ended_at: int) -> None:
-        """Write facts of the end, index and footer; count unwritten samples before ``ended_at``."""
+        """Write facts of the end, index and footer; samples before ``ended_at`` are missing."""
         self._late_missing = ended_at - self.samples
         counted = {"recorded_samples": str(self.samples), "missing_samples": str(self.missing)}
         self._writer.add_metadata("hilctl.end", sealed("hilctl.end", {**end, **counted}))

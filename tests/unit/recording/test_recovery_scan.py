@@ -45,7 +45,7 @@ def test_other_files_have_no_records():
 
 @pytest.mark.parametrize(("damages", "text"), [
     ([], "its end and index are missing"),
-    ([Damage(9, 5, "index")], "its index is damaged or cut"),
+    ([Damage(9, 5, "index")], "its index is damaged or truncated"),
     ([Damage(9, 5, "damaged record")], "damaged record at byte 9 (5 bytes)"),
     ([Damage(9, 5, "damaged chunk", 3)] * 4,
      "damaged chunk at byte 9 (5 bytes, 3 messages of it saved without a checksum), "
