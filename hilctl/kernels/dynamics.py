@@ -205,8 +205,8 @@ def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Pass a displacement through a pair of antiresonance and resonance.
 
     ``parameters`` is float64[12]: coefficients of position and velocity after a sample, each for
-    position, velocity and x before it and x after it; weights of position, velocity and x in the
-    output; the weight of x in the output of its own sample. ``memory`` is float64[3]: position,
+    position, velocity and x before it and for the next x; weights of position, velocity and x in
+    the output; weight of x in the output of its sample. ``memory`` is float64[3]: position,
     velocity, the previous x.
     """
     for k in range(x.size):

@@ -78,8 +78,7 @@ def _followed(y: float, w: float, target: float, band: Band) -> tuple[float, flo
     way = 0 if target >= y else 1
     by_y, going, k = 0.0, True, 0
     while going:
-        # Whole steps, then the remainder, so that the final field is a continuous function of the
-        # target.
+        # Whole steps, then the remainder, so that the final field is continuous in the target.
         first, _, i, j, _, _ = _slope(y, w - _along(y, lines, 0, grid), way, slopes, grid)
         rest = target - y
         going = abs(rest) > steps[way, i, j] and k < _MOST_STEPS
@@ -227,8 +226,7 @@ def duhem_forward(v: F64, band: Band, losses: Losses, memory: F64, out: F64) -> 
     """Run the model.
 
     ``v`` is float64[n], commands, each held through the sample that ends with its output; a command
-    that is not finite gives NaN and does not change the memory. ``out`` is float64[n], filled with
-    y.
+    that is not finite gives NaN and changes no memory. ``out`` is float64[n], filled with y.
     """
     for k in range(v.size):
         if abs(v[k]) < math.inf:

@@ -1,11 +1,10 @@
 """An operator of plays after a model, its inverse, and the adaptation of its parameters.
 
 The operator is x + g (x - c) + sum w_i (P_i[x] - c_i), in um, with x the sum of a model's output
-and an offset. It describes the difference between actuator and model. The offset comes first, so
-that x stays in the range of the references. It is a Prandtl-Ishlinskii operator, with an exact
-inverse if 1 + g and all sums 1 + g + w_1 + ... + w_i are above 0: K. Kuhnen and H. Janocha,
-"Adaptive inverse control of piezoelectric actuators with hysteresis operators", Proc. European
-Control Conference (1999).
+and an offset: the actuator relative to the model. The offset comes first, so x stays in the range
+of the references. It is a Prandtl-Ishlinskii operator, with an exact inverse if 1 + g and all sums
+1 + g + w_1 + ... + w_i are above 0: K. Kuhnen and H. Janocha, "Adaptive inverse control of
+piezoelectric actuators with hysteresis operators", Proc. European Control Conference (1999).
 
 The adapted parameters are not o, g and w_i, whose regressors are similar, but the coefficients of
 successively orthogonalised regressors, so a step or bound of one does not affect another.
@@ -204,8 +203,7 @@ def adapt_block(
         operator: Its constants.
         lines: Delay lines, NaN for samples to ignore.
         memory: float64[m - 1], of the plays.
-        state: float64[5, m], parameters, their conversion to o, g and w_i, smoothed gradient,
-            scratch.
+        state: float64[5, m], parameters, these as o, g and w_i, smoothed gradient, scratch.
 
     Returns:
         Number of samples used.

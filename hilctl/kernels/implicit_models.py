@@ -1,7 +1,6 @@
 """Models without an analytic inverse: Preisach, Krasnosel'skii-Pokrovskii, Bouc-Wen.
 
-For a given memory, the displacement is a non-decreasing function of the next command, so the
-inverse is a root.
+For a given memory, the displacement never falls as the next command rises: the inverse is a root.
 
 A model is a number and three arrays. Preisach (0): thresholds r_i, float64[m]; q_i at the edges of
 c cells, float64[m (c + 1)]; lowest edge, width of a cell, c. Krasnosel'skii-Pokrovskii (1): alpha,
@@ -223,9 +222,8 @@ def implicit_inverse(
 ) -> None:
     """Run the inverse of a model, one root per sample, with the memory of the model.
 
-    ``y`` is float64[n], displacement in um; a value that is not finite gives NaN and does not
-    change the memory. Commands stay within ``span``; the model's deviation from y is at most
-    ``tolerance`` > 0 um.
+    ``y`` is float64[n], displacement in um; a value that is not finite gives NaN and changes no
+    memory. Commands stay within ``span``; the model misses y by at most ``tolerance`` > 0.
     """
     for k in range(y.size):
         target = y[k]

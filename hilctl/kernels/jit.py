@@ -111,8 +111,7 @@ def kernel(*, inline: bool = False, nogil: bool = False) -> Callable[[Function],
     Args:
         inline: Always inline it into the kernels that call it: for those called once per sample.
             Such a kernel must not use an array inside ``if`` or leave a loop by ``break``: numba
-            then counts references to its arrays at every call, which takes longer than the
-            computation.
+            then counts references to its arrays at every call, which takes longer than the work.
         nogil: Release the interpreter lock during a call: for long work beside other threads. No
             other thread may change its arrays meanwhile.
 

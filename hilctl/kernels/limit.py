@@ -21,8 +21,7 @@ def limit_block(
 
     A request that is not finite is replaced by the last command. No step is larger than
     ``max_step`` > 0. If ``previous``, the last command, lies within [low, high], every result does;
-    otherwise the results return in steps of ``max_step``. The bit of each reason is added to the
-    flags.
+    otherwise the results return in steps of ``max_step``. Each reason sets its bit in the flags.
 
     Return the index of the first request that is not finite, or -1.
     """

@@ -1,7 +1,6 @@
 """The residual of a model as an operator on the modelled displacement.
 
-With ``x`` the displacement of a model relative to rest, the displacement of the actuator is x +
-R[x], and
+With ``x`` the displacement of a model relative to rest, the actuator's is x + R[x], and
 
     R[x] = sum q_i(F_i[x]) + sum (a_i(x) s_i + b_i(x) s_i^2) + c(x) rate
 
