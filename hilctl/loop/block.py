@@ -27,7 +27,7 @@ class Block:
         displacement_um: Filled by the device: float64[B].
         measured: Measured command, filled by the device if it has one: float64[B].
         input_um: The compensator's input: float64[B]; in the waveform's unit without a model.
-        reading_age_s: Age of the displacement, if the sensor sends unasked: float64[B].
+        reading_age_s: Age of the displacement, if the sensor sends unsolicited samples: float64[B].
         reading_um: Displacement before its correction, if there is a calibration: float64[B].
         aux: Auxiliary channels of the device: float64[a].
     """

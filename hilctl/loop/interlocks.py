@@ -283,8 +283,7 @@ class Interlocks:
     ) -> Trip:
         """Return the trip; if there are several, a cause takes precedence over its consequence.
 
-        ``sent`` is previous command, command, measured command; ``seen`` is reference,
-        displacement.
+        ``sent``: previous command, command, measured command; ``seen``: reference, displacement.
         """
         reference, displacement = seen
         settings = self.settings

@@ -49,7 +49,7 @@ _DESCRIPTIONS: dict[OutputState, str] = {
 
 
 def describe(state: OutputState, error: str = "") -> str:
-    """Return a description of the output's state; ``error``: why it is not confirmed."""
+    """Return a description of the output's state; ``error`` is the reason if unconfirmed."""
     return f"{_DESCRIPTIONS[state]}: {error}" if error else _DESCRIPTIONS[state]
 
 

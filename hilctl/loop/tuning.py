@@ -35,8 +35,7 @@ class Tuning:
 
     Attributes:
         samples: Duration of the change.
-        begins_at: First sample of the change; if it is in the past, the change begins with the next
-            block.
+        begins_at: First sample of the change; the next block if it is in the past.
         inverse_share: Share of the inverse in the command, 0 to 1; the line has the rest.
     """
 
