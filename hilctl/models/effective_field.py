@@ -77,8 +77,7 @@ class FieldLosses(StrictModel):
         """Return the losses in the form of the kernels.
 
         A command is constant during a sample, so field and losses are means over the sample.
-        ``span`` is the span of the effective fields, ``slope`` the operators' mean slope in um per
-        command unit.
+        ``span`` is that of the effective fields, ``slope`` the mean slope in um per command unit.
         """
         lags = self.decay_s * sample_rate_hz
         lag_s = self.field_s + self.output_s * slope

@@ -47,9 +47,8 @@ class ButterflyModel(RateDependentPlays):
     def inverse(self, sample_rate_hz: float) -> Operator:
         """Return the operator from um to command, at rest, on one wing of the butterfly.
 
-        The actuator is shortest at the point where the wings meet; a smaller displacement gets the
-        command of that point. Raise ModelError if the displacement range is unknown or extends
-        below it.
+        The actuator is shortest at the point where the wings meet; a smaller displacement gets its
+        command. Raise ModelError if the displacement range is unknown or extends below it.
         """
         turning_um = self.output_offset_um
         if self.output_range_um is None or self.output_range_um[0] < turning_um:
