@@ -104,9 +104,8 @@ class _Instants:
     def cycles(self, frequency_hz: float) -> F64:
         """Return the phase of a frequency in cycles: float64[n], 0 to 1.
 
-        Frequency and rate are used as the decimal numbers that the user wrote, so that all periods
-        of a whole number of samples have the same bits. With rounded times every cycle would differ
-        slightly, like noise.
+        Frequency and rate are used as the user's decimal numbers, so that all periods of a whole
+        number of samples have the same bits. Rounded times would make cycles differ, like noise.
         """
         turn = _decimal(frequency_hz) / _decimal(self.rate_hz) % 1
         if turn.denominator > _LONGEST_PERIOD:
