@@ -526,5 +526,5 @@ def _check_trip(
     if has.on_trip in {"zero", "reset"} and abs(at_zero - safe_command) > 1e-9:
         raise InputError(
             f"the watchdog of {title} sets {name} to 0 {output.unit}, which is {at_zero:g} "
-            f"{unit} here: watchdog.safe_command must be that, got {wanted.safe_command:g}"
+            f"{unit} here: set watchdog.safe_command to {at_zero:g}, got {safe_command:g}"
         )
