@@ -39,7 +39,7 @@ if TYPE_CHECKING:
     from hilctl.api.recordings import RecordedRun, export, list_runs, read, replay, summarize
     from hilctl.api.reports import contour, figures, report_page, report_runs
     from hilctl.api.responses import frf, spectrum, step, tune
-    from hilctl.api.runs import WrittenExperiment, check, init, load, run
+    from hilctl.api.runs import WrittenExperiment, check, check_axes, init, load, run
     from hilctl.api.studies import StepFaultError, StepStoppedError, StudyRun, StudyStep, study
     from hilctl.api.tables import RunTable, SampleTable
 
@@ -47,9 +47,9 @@ __all__ = [
     "ConfigError", "DataError", "DeviceError", "HilctlError", "InputError", "LoadedModel",
     "ModelError", "RecordedRun", "RunConnection", "RunError", "RunTable", "SampleTable",
     "StepFaultError", "StepStoppedError", "StudyRun", "StudyStep", "WrittenExperiment",
-    "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise", "check", "compare",
-    "connect", "contour", "export", "export_model", "figures", "frf", "identify", "init",
-    "learn", "list_runs", "load", "load_model", "read", "refine", "replay", "report_page",
+    "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise", "check", "check_axes",
+    "compare", "connect", "contour", "export", "export_model", "figures", "frf", "identify",
+    "init", "learn", "list_runs", "load", "load_model", "read", "refine", "replay", "report_page",
     "report_runs", "run", "spectrum", "step", "study", "summarize", "tune",
 ]  # fmt: skip
 
@@ -68,7 +68,7 @@ if not TYPE_CHECKING:
         "models": {"LoadedModel", "compare", "export_model", "identify", "load_model", "refine"},
         "reports": {"contour", "figures", "report_page", "report_runs"},
         "responses": {"frf", "spectrum", "step", "tune"},
-        "runs": {"WrittenExperiment", "check", "init", "load", "run"},
+        "runs": {"WrittenExperiment", "check", "check_axes", "init", "load", "run"},
         "studies": {"StepFaultError", "StepStoppedError", "StudyRun", "StudyStep", "study"},
         "tables": {"RunTable", "SampleTable"},
     }  # fmt: skip

@@ -11,10 +11,10 @@ from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Settings, texts_of
 from hilctl.experiment.examples import copy_schema
 from hilctl.experiment.load import LoadedExperiment, load_experiment
-from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
 from hilctl.experiment.template import starting_device, starting_experiment
 from hilctl.run.result import Progress, RunResult
-from hilctl.run.start import checked_experiment, output_of, start_run
+from hilctl.run.start import checked_experiment, checked_run, output_of, start_run
 from hilctl.run.unpaced import run_unpaced
 
 
@@ -109,6 +109,22 @@ def check(experiment: PathLike, settings: Settings = ()) -> CheckedExperiment:
         InputError: The experiment cannot run; the error lists all problems.
     """
     return checked_experiment(Path(experiment), texts_of(settings))
+
+
+def check_axes(experiment: PathLike, settings: Settings = ()) -> CheckedRun:
+    """Check an experiment with one axis or several, see :func:`check`; nothing moves.
+
+    Args:
+        experiment: Experiment file (YAML).
+        settings: Overrides of the experiment; ``axis=NAME`` chooses one axis.
+
+    Returns:
+        The checked axes, in ``axes``, and notes on them together.
+
+    Raises:
+        InputError: The experiment cannot run; the error lists all problems.
+    """
+    return checked_run(Path(experiment), texts_of(settings))
 
 
 def run(

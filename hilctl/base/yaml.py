@@ -21,6 +21,7 @@ import types
 import typing
 import unicodedata
 from collections.abc import Callable, Iterable, Mapping, Sequence
+from copy import copy
 from dataclasses import replace
 from pathlib import Path
 from typing import Annotated, Any, NamedTuple, TypeAlias, TypeVar
@@ -518,6 +519,40 @@ class Document:
         ends = range(len(loc), -1, -1)
         return next((self._places[loc[:end]] for end in ends if self.holds(loc[:end])), self.name)
 
+    def copied(self) -> "Document":
+        """Return a copy; changes of one do not affect the other."""
+        own = copy(self)  # each change replaces data and places
+        own.assignments = [*self.assignments]
+        return own
+
+    def remove(self, key: str) -> None:
+        """Remove a key of the top level, if it is there."""
+        self.data = {name: value for name, value in self.data.items() if name != key}
+        self._places = {at: where for at, where in self._places.items() if at[:1] != (key,)}
+
+    def part(self, loc: Loc, name: str) -> "Document":
+        """Return a copy with the mapping at ``loc`` laid over it, without its parent.
+
+        Mappings are laid over key by key; one of another ``kind`` replaces the one below it. The
+        place of a value of the part ends with ``name``.
+        """
+        over = {
+            at[len(loc) :]: f"{where}, {name}"
+            for at, where in self._places.items()
+            if at[: len(loc)] == loc and len(at) > len(loc)
+        }
+        own, value = self.copied(), self.value(loc)
+        own.remove(str(loc[0]))
+        own.lay_over(value, over)
+        return own
+
+    def lay_over(self, value: Mapping[str, Any], places: Mapping[Loc, str]) -> None:
+        """Lay a mapping over the document, with the places of its values."""
+        self.data = _laid_over(self.data, value)
+        # Those of a mapping that was replaced would be left over.
+        known = {**self._places, **places}.items()
+        self._places = {at: where for at, where in known if _is_in(self.data, at)}
+
     def problem(self, key: str, rule: str, value: str = "", hint: str = "") -> ConfigProblem:
         """Return a broken rule with the place of its dotted key."""
         return ConfigProblem(self.where(loc_of(key)), key, rule, value, hint)
@@ -611,3 +646,24 @@ def _replaced(data: Any, loc: Loc, value: Any) -> Any:
         return (*data[:head], _replaced(data[head], rest, value), *data[head + 1 :])
     before = {} if data == "none" else data
     return {**before, head: _replaced(before.get(head, {}), rest, value)}
+
+
+def _laid_over(under: Any, over: Any) -> Any:
+    """Return a value laid over another: mappings key by key, unless their kinds differ."""
+    if not (isinstance(under, dict) and isinstance(over, dict)):
+        return over
+    if under.get("kind", over.get("kind")) != over.get("kind", under.get("kind")):
+        return over
+    laid = {key: _laid_over(under[key], each) if key in under else each
+            for key, each in over.items()}  # fmt: skip
+    return {**under, **laid}
+
+
+def _is_in(data: Any, loc: Loc) -> bool:
+    """Return whether data have a value at a location."""
+    for part in loc:
+        try:
+            data = data[part]
+        except (KeyError, IndexError, TypeError):
+            return False
+    return True

@@ -53,7 +53,8 @@ def experiment_keys() -> list[tuple[str, str]]:
     from hilctl.experiment.examples import schema_file
 
     schema = json.loads(schema_file().read_text(encoding="utf-8"))
-    return [(f"{key}=", meaning) for key, meaning in dict(_keys(schema, schema["$defs"])).items()]
+    found = dict(_keys(schema["else"], schema["$defs"]))
+    return [(f"{key}=", meaning) for key, meaning in found.items()]
 
 
 def _keys(node: dict[str, Any], definitions: dict[str, Any], at: str = "") -> Iterator[Any]:

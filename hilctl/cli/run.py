@@ -28,7 +28,7 @@ from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Se
 from hilctl.cli.output import Verbosity, print_json, print_result
 from hilctl.cli.reports import render_report
 from hilctl.experiment.labels import label_settings
-from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
 from hilctl.loop.interlocks import for_longer_than
 from hilctl.loop.safe_output import describe
 from hilctl.machine.diagnosis import log_out
@@ -160,15 +160,24 @@ def _detach(
 
 def check(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
     """Check an experiment and show what it would do (nothing moves)."""
-    checked = api.check(experiment, settings or [])
-    forecast = {
+    checked = api.check_axes(experiment, settings or [])
+    values: dict[str, Any] = {"experiment": str(experiment)}
+    if len(checked.axes) == 1:
+        values |= _forecast_mapping(checked.first)
+    else:
+        axes = zip(checked.names, checked.axes, strict=True)
+        values["notes"] = list(checked.notes)
+        values["axes"] = {name: _forecast_mapping(each) for name, each in axes}
+    print_result(values, lambda: print_forecast(checked), as_json=as_json)
+
+
+def _forecast_mapping(checked: CheckedExperiment) -> dict[str, Any]:
+    return {
         "warnings": list(checked.warnings),
         "expected_error": asdict(checked.expected) if checked.expected else None,
         "trigger": _trigger(checked),
         **checked.forecast.to_mapping(),
     }
-    values = {"experiment": str(experiment), **forecast}
-    print_result(values, lambda: print_forecast(checked), as_json=as_json)
 
 
 def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
@@ -250,12 +259,15 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
 
 
-def print_forecast(checked: CheckedExperiment) -> None:
-    """Print the forecast of a run and its warnings."""
+def print_forecast(checked: CheckedRun) -> None:
+    """Print the forecast of each axis of a run, and its warnings."""
     terminal = console()
-    terminal.print(listing("", _forecast_rows(checked).items()))
-    for warning in checked.warnings:
-        terminal.print(f"warning: {warning}", style="yellow")
+    for name, axis in zip(checked.names, checked.axes, strict=True):
+        terminal.print(listing(name and f"Axis {name}", _forecast_rows(axis).items()))
+        for warning in axis.warnings:
+            terminal.print(f"warning: {warning}", style="yellow")
+    for note in checked.notes:
+        terminal.print(f"note: {note}")
     terminal.print("ready to run", style="green")
 
 

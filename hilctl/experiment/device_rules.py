@@ -2,11 +2,13 @@
 
 import math
 import re
-from collections.abc import Iterable, Iterator
+from collections.abc import Iterable, Iterator, Mapping
 from datetime import date
+from itertools import combinations
 
 from hilctl.base.device import AuxChannel, Device, DeviceInfo
 from hilctl.base.errors import ConfigProblem, DeviceError, broken
+from hilctl.experiment.axes import names_text
 from hilctl.experiment.rig import RunRig
 
 _YEAR_DAYS = 366
@@ -92,3 +94,43 @@ def channel_problems(channels: Iterable[AuxChannel]) -> Iterator[ConfigProblem]:
             hint = "end it with the unit, such as coil_c"
             yield broken(f"device.aux.{channel.name}", rule, hint=hint)
         seen.add(channel.name)
+
+
+def same_output_problems(axes: Mapping[str, DeviceInfo]) -> Iterator[tuple[str, ConfigProblem]]:
+    """Yield the axes that drive the output of an earlier one, with the broken rule."""
+    for (first, one), (second, other) in combinations(axes.items(), 2):
+        shared = sorted(set(one.holds) & set(other.holds))
+        if shared and one.output == other.output:
+            output = f"{other.output} of {shared[0]}" if other.output else shared[0]
+            rule = f"{output} is that of {first}: each axis needs its own"
+            yield second, broken("device.output" if other.output else "device", rule)
+
+
+def clock_problems(
+    axes: Mapping[str, DeviceInfo], rate_hz: float, block: int
+) -> Iterator[ConfigProblem]:
+    """Yield the broken rules on the devices of several axes, which one clock must drive.
+
+    Simulated devices step on the sample count: they have no clocks, and take no time.
+    """
+    if len({(each.buffered, each.latency_blocks) for each in axes.values()}) > 1:
+        rule = "all devices must have a FIFO, or none, and the same latency in blocks"
+        found = (f"{name} {each.latency_blocks}" for name, each in axes.items())
+        yield broken("axes", rule, ", ".join(found))
+    real = {name: each for name, each in axes.items() if not each.simulated}
+    clocks = {each.holds: name for name, each in real.items() if each.buffered}
+    if block > 1 and len(clocks) > 1:
+        rule = f"must be 1: {names_text([*clocks.values()])} have clocks of their own, which drift "
+        hint = "two outputs of one device may stream"
+        yield broken("block", f"{rule}apart", str(block), hint)
+    turn_s = {name: 1.0 / each.max_rate_hz for name, each in real.items()}
+    total_s = sum(turn_s.values())
+    if len(real) > 1 and rate_hz * total_s > 1.0:
+        each_ms = ", ".join(f"{name} {1e3 * duration_s:.3g}" for name, duration_s in turn_s.items())
+        rule = f"must be <= {1.0 / total_s:.4g}"
+        hint = f"the axes are exchanged in turn, in ms: {each_ms}"
+        yield broken("sample_rate_hz", rule, f"{rate_hz:g}", hint)
+    if real:
+        verb = "is" if len(real) == 1 else "are"
+        hint = f"{names_text([*real])} {verb} real: add --set axis={next(iter(real))} to run one"
+        yield broken("axes", "several axes run on simulated devices only", hint=hint)

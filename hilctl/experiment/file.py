@@ -29,6 +29,9 @@ from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.rt_setup import Realtime
 from hilctl.waveforms.spec import AnyWaveform
 
+AXIS_NAME = "[a-z][a-z0-9_]*"
+"""Pattern of the names of axes."""
+MAX_AXES = 8
 _NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
 
 
@@ -46,18 +49,13 @@ Name = Annotated[
 ]
 
 
-class Experiment(StrictModel):
-    """One experiment.
+class AxisKeys(StrictModel):
+    """The keys of one axis, which differ between the axes of an experiment with ``axes``.
 
     Attributes:
-        name: Short name, part of the recording's file name.
-        description: Purpose in words.
-        labels: Labels for searches of runs, such as operator, sample or temperature.
         device: ``kind`` and the device's own options.
         amplifier: Largest voltage of the amplifier that drives the coil, for devices driven in A.
             A run that needs more is refused. Default: not checked.
-        sample_rate_hz: Samples per second.
-        block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
         waveform: The reference.
         compensator: ``none``, or the model to invert.
         condition: Cycle before the waveform that erases the history of the actuator. Default: none.
@@ -66,22 +64,12 @@ class Experiment(StrictModel):
             ``limits.stroke_um``.
         feedback: Controller around the compensator. Default: none.
         adaptation: Adaptation of the compensator's model during the run. Default: none.
-        trigger: Digital output at marks of the waveform, and start by a digital input. Default:
-            none.
         limits: Limits of the run.
         safe: The safe value, and the safe ramp to it.
-        timing: Policy for late ticks.
-        recording: Recording of the run.
-        realtime: Real-time settings of the loop process.
     """
 
-    name: Name
-    description: str = ""
-    labels: Labels = Field(default_factory=dict)
     device: dict[str, Any]
     amplifier: VoltageLimit | None = None
-    sample_rate_hz: Annotated[float, Field(ge=1e-3, le=1e6)]
-    block: Annotated[int, Field(ge=1, le=4096)] = 1
     waveform: AnyWaveform
     compensator: Annotated[
         CompensatorConfig | None,
@@ -93,9 +81,32 @@ class Experiment(StrictModel):
     zero: bool = False
     feedback: FeedbackConfig | None = None
     adaptation: AdaptationConfig | None = None
-    trigger: Trigger | None = None
     limits: Limits
     safe: Safe = Field(default_factory=Safe)
+
+
+class Experiment(AxisKeys):
+    """One experiment with one axis, or one axis of an experiment with the keys of its run.
+
+    Attributes:
+        name: Short name, part of the recording's file name.
+        description: Purpose in words.
+        labels: Labels for searches of runs, such as operator, sample or temperature.
+        sample_rate_hz: Samples per second.
+        block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
+        trigger: Digital output at marks of the waveform, and start by a digital input. Default:
+            none. Of several axes, the first one has the marks and the channels.
+        timing: Policy for late ticks.
+        recording: Recording of the run.
+        realtime: Real-time settings of the loop process.
+    """
+
+    name: Name
+    description: str = ""
+    labels: Labels = Field(default_factory=dict)
+    sample_rate_hz: Annotated[float, Field(ge=1e-3, le=1e6)]
+    block: Annotated[int, Field(ge=1, le=4096)] = 1
+    trigger: Trigger | None = None
     timing: Timing = Field(default_factory=Timing)
     recording: RecordingConfig = Field(default_factory=RecordingConfig)
     realtime: Realtime = Field(default_factory=Realtime)
@@ -143,8 +154,8 @@ class Experiment(StrictModel):
 
 def experiment_schema() -> dict[str, Any]:
     """Return the JSON schema of experiment files, including the options of all known devices."""
-    schema = Experiment.model_json_schema()
-    definitions = schema["$defs"]
+    one = Experiment.model_json_schema()
+    definitions = one.pop("$defs")
     choices = []
     for kind in known_devices():
         part = options_schema(kind)
@@ -153,8 +164,51 @@ def experiment_schema() -> dict[str, Any]:
         part["required"] = ["kind", *part.get("required", [])]
         definitions[f"device_{kind}"] = part
         choices.append({"$ref": f"#/$defs/device_{kind}"})
-    schema["properties"]["device"] = {"oneOf": choices, "description": "kind and its options"}
-    return {"$schema": "https://json-schema.org/draft/2020-12/schema", **schema}
+    one["properties"]["device"] = {"oneOf": choices, "description": "kind and its options"}
+    parts = {key: _part(one["properties"][key], definitions) for key in AxisKeys.model_fields}
+    axis = {"type": "object", "properties": parts, "additionalProperties": False}
+    axes = {
+        "type": "object",
+        "description": "keys of each axis by its name, laid over those of the file",
+        "propertyNames": {"pattern": f"^{AXIS_NAME}$"},
+        "minProperties": 2,
+        "maxProperties": MAX_AXES,
+        "additionalProperties": axis,
+    }
+    required = [key for key in one["required"] if key not in AxisKeys.model_fields]
+    of_all = {"properties": {**one["properties"], **parts, "axes": axes}, "required": required}
+    definitions |= {"Experiment": one, "Experiment_of_axes": {**one, **of_all}}
+    return {
+        "$schema": "https://json-schema.org/draft/2020-12/schema",
+        "$defs": definitions,
+        "if": {"required": ["axes"]},
+        "then": {"$ref": "#/$defs/Experiment_of_axes"},
+        "else": {"$ref": "#/$defs/Experiment"},
+    }
+
+
+def _part(node: Any, definitions: dict[str, Any]) -> Any:
+    """Return a schema without required keys, which other parts of the file may set.
+
+    The definitions that it needs are added to ``definitions``.
+    """
+    if isinstance(node, list):
+        return [_part(each, definitions) for each in node]
+    if not isinstance(node, dict):
+        return node
+    found: dict[str, Any] = {}
+    for key, value in node.items():
+        if key == "$ref":
+            name = value.rpartition("/")[2]
+            if f"{name}_part" not in definitions:
+                definitions[f"{name}_part"] = {}  # a schema may contain itself
+                definitions[f"{name}_part"] = _part(definitions[name], definitions)
+            found[key] = f"{value}_part"
+        elif key == "properties":
+            found[key] = {name: _part(each, definitions) for name, each in value.items()}
+        elif key not in {"required", "discriminator"}:
+            found["anyOf" if key == "oneOf" else key] = _part(value, definitions)
+    return found
 
 
 def schema_text() -> str:

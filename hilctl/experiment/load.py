@@ -1,7 +1,11 @@
-"""Load an experiment file and all files that it refers to."""
+"""Load an experiment file and all files that it refers to.
+
+A file with ``axes`` is one experiment per axis: the keys of each axis laid over those of the file.
+"""
 
 import json
 import os
+import re
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from dataclasses import dataclass, field
 from pathlib import Path
@@ -12,10 +16,16 @@ from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
 from hilctl.base.files import TextFiles, is_file
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document, dump, load_document, loc_of
+from hilctl.experiment.axes import (
+    axis_documents,
+    one_axis_document,
+    problems_of_axes,
+    with_settings,
+)
 from hilctl.experiment.conditioning import make_conditioning
 from hilctl.experiment.correction import Correction, load_correction
 from hilctl.experiment.devices import made_device
-from hilctl.experiment.file import Experiment
+from hilctl.experiment.file import AXIS_NAME, Experiment
 from hilctl.experiment.open_loop import MeasuredResponse, load_response
 from hilctl.experiment.rig import RunRig
 from hilctl.experiment.safe import safe_problems
@@ -43,6 +53,7 @@ class LoadedExperiment:
         correction: Learned correction of the reference, or None.
         response: Measured response for the margins of the feedback, or None.
         files: Contents of the files it refers to.
+        axis: Name of the axis; empty if it is the only one.
     """
 
     config: Experiment
@@ -54,6 +65,7 @@ class LoadedExperiment:
     correction: Correction | None = None
     response: MeasuredResponse | None = None
     files: TextFiles = field(default_factory=TextFiles)
+    axis: str = ""
 
     @property
     def rig(self) -> RunRig:
@@ -87,42 +99,62 @@ def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperimen
     """Read an experiment file, apply ``key=value`` settings, and load what it refers to.
 
     A file name in a setting is relative to the working folder, or else to the experiment's folder.
+    The setting ``axis=NAME`` chooses one axis; the other settings are then those of the axis.
 
     Raises:
         InputError: The file cannot be read.
         ConfigError: Rules are broken; the error lists every one of them.
     """
-    from_here = [named_from(path.parent, setting) for setting in settings]
-    return resolve(load_document(path), path.parent, from_here)
+    return resolve(load_document(path), path.parent, _from_here(path, settings))
+
+
+def load_axes(path: Path, settings: Sequence[str] = ()) -> tuple[LoadedExperiment, ...]:
+    """Load an experiment file with one axis or several, see :func:`load_experiment`."""
+    document = with_settings(load_document(path), _from_here(path, settings))
+    files, loaded = TextFiles(), []
+    problems: dict[str, Sequence[ConfigProblem]] = {}
+    for axis, part in axis_documents(document).items():
+        problems[axis] = ()
+        try:
+            loaded.append(_resolved(part, path.parent, files, axis))
+        except ConfigError as error:
+            problems[axis] = error.problems
+    if any(problems.values()):
+        raise ConfigError(problems_of_axes(problems))
+    return tuple(loaded)
 
 
 def input_files(document: Document, path: Path) -> list[Path]:
     """Return the experiment file and the files that its keys name."""
-    names = [document.value(loc_of(key)) for key in sorted(FILE_KEYS)]
+    axes = document.data.get("axes")
+    prefixes = [(), *(("axes", name) for name in axes)] if isinstance(axes, dict) else [()]
+    names = [
+        document.value((*prefix, *loc_of(key))) for prefix in prefixes for key in sorted(FILE_KEYS)
+    ]
     # A profile may be the name of a shipped one.
     return [path, *(path.parent / name for name in names if isinstance(name, str))]
 
 
 def inputs_of(path: Path, settings: Sequence[str] = ()) -> list[Path]:
     """Return the files that a run of an experiment reads; raise InputError if it cannot be read."""
-    return input_files(
-        document_with(path, [named_from(path.parent, each) for each in settings]), path
-    )
+    return input_files(document_with(path, _from_here(path, settings)), path)
 
 
 def document_with(path: Path, settings: Iterable[str], files: TextFiles | None = None) -> Document:
     """Return an experiment file with ``key=value`` texts over it."""
-    document = load_document(path, files)
-    for setting in settings:
-        document.set(setting)
-    return document
+    return with_settings(load_document(path, files), settings)
+
+
+def _from_here(path: Path, settings: Iterable[str]) -> list[str]:
+    return [named_from(path.parent, setting) for setting in settings]
 
 
 def named_from(folder: Path, setting: str) -> str:
     """Return a ``key=value`` setting with its file name made relative to another folder."""
     key, _, text = setting.partition("=")
     name = text.strip().strip("'\"")
-    if key.strip() not in FILE_KEYS or not name or Path(name).is_absolute():
+    of_axis = re.sub(rf"^axes\.{AXIS_NAME}\.", "", key.strip())
+    if of_axis not in FILE_KEYS or not name or Path(name).is_absolute():
         return setting
     if not is_file(Path(name)):
         return setting
@@ -132,10 +164,14 @@ def named_from(folder: Path, setting: str) -> str:
 def resolve(
     document: Document, folder: Path, settings: Sequence[str] = (), files: TextFiles | None = None
 ) -> LoadedExperiment:
-    """Build an experiment from a YAML document, see :func:`load_experiment`."""
-    files = TextFiles() if files is None else files
-    for setting in settings:
-        document.set(setting)
+    """Build the experiment of one axis from a YAML document, see :func:`load_experiment`."""
+    document = one_axis_document(with_settings(document, settings))
+    return _resolved(document, folder, TextFiles() if files is None else files)
+
+
+def _resolved(
+    document: Document, folder: Path, files: TextFiles, axis: str = ""
+) -> LoadedExperiment:
     problems: list[ConfigProblem] = []
 
     def named(key: str, load: Callable[[Path, TextFiles], T]) -> T | None:
@@ -161,7 +197,7 @@ def resolve(
         raise ConfigError(problems)
     yaml_text = dump(document.data)
     return LoadedExperiment(
-        config, device, model, folder, yaml_text, document, correction, response, files
+        config, device, model, folder, yaml_text, document, correction, response, files, axis
     )
 
 

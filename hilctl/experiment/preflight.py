@@ -11,7 +11,7 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
-from hilctl.base.errors import ConfigProblem, InputError, broken
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
 from hilctl.experiment.adaptation import (
@@ -21,6 +21,7 @@ from hilctl.experiment.adaptation import (
     at_worst,
     worst_inputs,
 )
+from hilctl.experiment.axes import problems_of_axes
 from hilctl.experiment.compensator import (
     CompensatorStart,
     finite_problems,
@@ -35,11 +36,14 @@ from hilctl.experiment.cures import Course, cured
 from hilctl.experiment.device_rules import (
     calibration_warnings,
     channel_problems,
+    clock_problems,
     rate_problems,
+    same_output_problems,
     watchdog_problems,
 )
 from hilctl.experiment.device_state import heat_before, start_of
 from hilctl.experiment.feedback import feedback_problems
+from hilctl.experiment.file import Experiment
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.limits import (
     Excess,
@@ -125,13 +129,93 @@ class CheckedExperiment:
         return found + ([*invalid] or [each.problem for each in commands])
 
 
+@shown_briefly
+@dataclass(frozen=True, slots=True)
+class CheckedRun:
+    """A run of one or more axes that is ready to run.
+
+    Attributes:
+        axes: The experiment of each axis; keys of the run are the same in all.
+        notes: Notes on the axes together.
+    """
+
+    axes: tuple[CheckedExperiment, ...]
+    notes: tuple[str, ...] = ()
+
+    @property
+    def first(self) -> CheckedExperiment:
+        """The first axis, which stands for all in what they have in common."""
+        return self.axes[0]
+
+    @property
+    def config(self) -> Experiment:
+        """The experiment of the first axis, for the keys of the run."""
+        return self.first.loaded.config
+
+    @property
+    def names(self) -> list[str]:
+        """Names of the axes; one empty name if there is only one."""
+        return [each.loaded.axis for each in self.axes]
+
+    @property
+    def holds(self) -> tuple[str, ...]:
+        """Resources of the devices of all axes, see :attr:`DeviceInfo.holds`."""
+        return tuple(
+            dict.fromkeys(name for each in self.axes for name in each.loaded.device.info.holds)
+        )
+
+
+def check_axes(loaded: Sequence[LoadedExperiment], heat_a2: float | None = 0.0) -> CheckedRun:
+    """Check the experiment of each axis, see :func:`check`, and the axes together.
+
+    Raises:
+        ConfigError: The run is rejected; all reasons are listed.
+    """
+    now, axes = MachineTime.now(), list[CheckedExperiment]()
+    problems: dict[str, Sequence[ConfigProblem]] = {}
+    for one in loaded:
+        problems[one.axis] = ()
+        try:
+            axes.append(check(one, heat_a2, now))
+        except ConfigError as error:
+            problems[one.axis] = error.problems
+    if found := [*_joint_problems(loaded), *problems_of_axes(problems)]:
+        raise ConfigError(found)
+    samples = [each.reference.values.size for each in axes]
+    longest = axes[samples.index(max(samples))]
+    notes = []
+    for k, each in enumerate(axes):
+        if samples[k] < max(samples):
+            axes[k] = check(each.loaded, heat_a2, now, hold_until=max(samples))
+            ends = f"{each.loaded.axis} ends after {each.forecast.duration_s:g} s"
+            until = f"{longest.loaded.axis} ends after {longest.forecast.duration_s:g} s"
+            notes.append(f"{ends} and holds its last value until {until}")
+    return CheckedRun(tuple(axes), tuple(notes))
+
+
+def _joint_problems(loaded: Sequence[LoadedExperiment]) -> Iterator[ConfigProblem]:
+    """Yield the broken rules on the axes together, with their places."""
+    first, documents = loaded[0], {each.axis: each.document for each in loaded}
+    infos = {each.axis: each.device.info for each in loaded}
+    if len(infos) < 2:
+        return
+    for axis, problem in same_output_problems(infos):
+        yield from documents[axis].refusal([problem]).problems
+    rate_hz, block = first.config.sample_rate_hz, first.config.block
+    yield from first.document.refusal(clock_problems(infos, rate_hz, block)).problems
+
+
 def check(
-    loaded: LoadedExperiment, heat_a2: float | None = 0.0, now: MachineTime | None = None
+    loaded: LoadedExperiment,
+    heat_a2: float | None = 0.0,
+    now: MachineTime | None = None,
+    hold_until: int = 0,
 ) -> CheckedExperiment:
     """Compute the complete run and check it against device, model and limits.
 
     The heat of the coil is at least ``heat_a2``, in A^2, whatever the last run left; None for a
     coil that has cooled down by then. ``now`` is the time of the start; None for the present.
+    A waveform with fewer samples than ``hold_until`` holds its last value.
 
     Raises:
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
@@ -145,6 +229,7 @@ def check(
     rest = _rest(loaded)
     with _refused(loaded, "waveform", problems):
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder, rest)
+        reference = reference.held(hold_until)
     _warn_of_long_work(reference)
     findings = range_findings(loaded.model, reference)
     problems += findings.refused

@@ -26,8 +26,8 @@ from hilctl.base.errors import DataError, HilctlError, InputError, RunError
 from hilctl.base.files import check_no_input, make_folder
 from hilctl.base.subprocesses import python_command
 from hilctl.experiment.correction import dump_correction
-from hilctl.experiment.load import LoadedExperiment, input_files, load_experiment
-from hilctl.experiment.preflight import CheckedExperiment, check
+from hilctl.experiment.load import LoadedExperiment, input_files, load_axes, load_experiment
+from hilctl.experiment.preflight import CheckedExperiment, CheckedRun, check, check_axes
 from hilctl.machine.reserve import RESERVE
 from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends
@@ -54,6 +54,14 @@ def checked_experiment(
     if loaded.device.info.holds:
         finish_dead_runs()
     return check(loaded, heat_a2)
+
+
+def checked_run(path: Path, settings: Sequence[str], heat_a2: float = 0.0) -> CheckedRun:
+    """Load an experiment with one axis or several and check it, see :func:`checked_experiment`."""
+    loaded = load_axes(path, settings)
+    if any(each.device.info.holds for each in loaded):
+        finish_dead_runs()
+    return check_axes(loaded, heat_a2)
 
 
 def output_of(checked: CheckedExperiment, output: Path | None) -> Path:

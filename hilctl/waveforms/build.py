@@ -2,7 +2,7 @@
 
 import math
 from collections.abc import Sequence
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -153,6 +153,14 @@ class Reference:
     def telling(self) -> tuple[slice, ...]:
         """Representative parts: all of it except most periods of long periodic parts."""
         return telling(self.values.size, self.repeats)
+
+    def held(self, samples: int) -> "Reference":
+        """Return the reference with its last value repeated up to a number of samples."""
+        if (more := samples - self.values.size) <= 0:
+            return self
+        values = np.pad(self.values, (0, more), mode="edge")
+        values.flags.writeable = False
+        return replace(self, values=values)
 
 
 @dataclass(frozen=True, slots=True)

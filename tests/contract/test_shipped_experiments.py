@@ -7,8 +7,8 @@ import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.load import load_experiment, resolve
-from hilctl.experiment.preflight import check
+from hilctl.experiment.load import load_axes, resolve
+from hilctl.experiment.preflight import check, check_axes
 from hilctl.models.model_file import load_model
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -33,9 +33,9 @@ def test_experiment(name):
     path = CONFIGS / name
     first = path.read_text(encoding="utf-8").splitlines()[0]
     assert first == "# yaml-language-server: $schema=schema.json"
-    checked = check(load_experiment(path))
-    assert checked.loaded.config.name == path.stem
-    assert checked.forecast.samples > 0
+    checked = check_axes(load_axes(path))
+    assert checked.config.name == path.stem
+    assert all(each.forecast.samples > 0 for each in checked.axes)
 
 
 @pytest.mark.parametrize("name", MODELS)

@@ -244,7 +244,8 @@ class TestSchema:
         assert all(set(each.get("required", [])) <= set(each["properties"]) for each in found)
 
     def test_devices(self, schema):
-        choices = [each["$ref"] for each in schema["properties"]["device"]["oneOf"]]
+        one = schema["$defs"]["Experiment"]
+        choices = [each["$ref"] for each in one["properties"]["device"]["oneOf"]]
         assert choices == [f"#/$defs/device_{kind}" for kind in registry.known_devices()]
         for kind in registry.known_devices():
             part = schema["$defs"][f"device_{kind}"]

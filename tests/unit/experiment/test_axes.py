@@ -1,0 +1,194 @@
+"""Experiments with several axes: keys laid over, places in messages, joint rules."""
+
+from dataclasses import replace
+from pathlib import Path
+
+import pytest
+
+from hilctl.base.errors import ConfigError
+from hilctl.base.yaml import Document
+from hilctl.experiment.axes import axis_documents, with_settings
+from hilctl.experiment.device_rules import clock_problems, same_output_problems
+from hilctl.experiment.load import input_files, inputs_of, load_axes, load_experiment
+from hilctl.experiment.preflight import check_axes
+
+CONFIGS = Path(__file__).parents[3] / "configs"
+STAGE = CONFIGS / "stage_xy.yaml"
+
+TEXT = """\
+name: stage
+device: {kind: simulated_terfenol}
+sample_rate_hz: 1000
+waveform: {kind: sine, unit: A, amplitude: 1.0, frequency_hz: 5.0, duration_s: 1.0}
+compensator: none
+trigger: {output: cycle}
+limits: {peak_current_a: 7.0, slew_a_per_s: 1e6, stroke_um: [-75.0, 60.0]}
+axes:
+  x:
+    device: {seed: 1}
+  y:
+    device: {seed: 2}
+    waveform: {kind: hold, unit: A, level: 1.0, duration_s: 0.5}
+"""
+
+
+@pytest.fixture
+def stage(tmp_path):
+    """Return a function that writes an experiment with two axes."""
+
+    def write(old="", new=""):
+        assert old in TEXT
+        path = tmp_path / "stage.yaml"
+        path.write_text(TEXT.replace(old, new) if old else TEXT, encoding="utf-8")
+        return path
+
+    return write
+
+
+def refused(path, *settings):
+    """Return the problems of a refused experiment."""
+    with pytest.raises(ConfigError) as error:
+        check_axes(load_axes(path, settings))
+    return error.value.problems
+
+
+def test_mappings_are_laid_over_unless_their_kinds_differ(stage):
+    x, y = load_axes(stage())
+    assert [each.axis for each in (x, y)] == ["x", "y"]
+    assert x.config.device == {"kind": "simulated_terfenol", "seed": 1}
+    assert x.config.waveform.kind == "sine"
+    assert y.config.waveform.model_dump() == {**y.config.waveform.model_dump(), "level": 1.0}
+    assert "amplitude" not in y.document.data["waveform"]
+    assert not {"axes", "axis"} & y.document.data.keys()
+
+
+def test_the_first_axis_has_the_trigger(stage):
+    x, y = load_axes(stage())
+    assert (x.config.trigger is not None, y.config.trigger) == (True, None)
+    assert load_experiment(stage(), ["axis=y"]).config.trigger is not None
+
+
+def test_one_axis_is_an_experiment_of_its_own(stage):
+    """The text that a recording contains is that of a one-axis run."""
+    path = stage()
+    alone = load_experiment(path, ["axis=x"])
+    assert alone.axis == ""
+    assert alone.yaml_text == load_axes(path)[0].yaml_text
+    assert load_experiment(path, ["axis=x", "device.seed=9"]).config.device["seed"] == 9
+    settings = ["axes.x.waveform.amplitude=3", "waveform.frequency_hz=7", "axis=x"]
+    waveform = load_experiment(path, settings).config.waveform
+    assert (waveform.amplitude, waveform.frequency_hz) == (3.0, 7.0)
+
+
+def test_settings_are_those_of_all_axes_or_of_one(stage):
+    x, y = load_axes(stage(), ["waveform.amplitude=2", "axes.y.device.seed=5"])
+    assert x.config.waveform.amplitude == 2.0
+    assert [each.config.device["seed"] for each in (x, y)] == [1, 5]
+    assert y.document.where(("device", "seed")) == "--set axes.y.device.seed=5, y"
+
+
+@pytest.mark.parametrize(("settings", "where", "key"), [
+    (["axes.x.sample_rate_hz=5"], "--set axes.x.sample_rate_hz=5, x", "axes.x.sample_rate_hz"),
+    (["axes.X.zero=true"], "--set axes.X.zero=true", "axes.X"),
+    (["axes.y=none"], "--set axes.y=none", "axes.y"),
+    (["axes={}"], "--set axes={}", "axes"),
+    (["axes.x.device.sed=1"], "--set axes.x.device.sed=1, x", "device.sed"),
+    (["axis=z"], "--set axis=z", "axis"),
+    (["device.seed=3"], "--set device.seed=3", "device.seed"),  # each axis has its own
+])  # fmt: skip
+def test_wrong_settings(stage, settings, where, key):
+    (problem,) = refused(stage(), *settings)
+    assert (problem.where, problem.key) == (where, key)
+
+
+def test_a_problem_of_one_axis_names_it_and_the_line(stage):
+    path = stage("amplitude: 1.0", "amplitude: 9.0")
+    assert {each.where for each in refused(path)} == {f"{path}:7, x"}
+    path = stage("device: {seed: 2}", "device: {seed: two}")
+    assert {(each.where, each.key) for each in refused(path)} == {(f"{path}:12, y", "device.seed")}
+
+
+def test_a_problem_of_all_axes_is_listed_once(stage):
+    path = stage("1e6", "-1")
+    assert [each.where for each in refused(path)] == [f"{path}:7"]
+
+
+def test_commands_on_one_axis_ask_for_it(stage):
+    with pytest.raises(ConfigError, match=r"axes x and y.*--set axis=x"):
+        load_experiment(stage())
+    with pytest.raises(ConfigError) as error:
+        with_settings(Document("x.yaml", "name: one"), ["axis=x"])
+    assert [each.key for each in error.value.problems] == ["axis"]
+    assert list(axis_documents(Document("x.yaml", "name: one"))) == [""]
+
+
+def test_the_shorter_axis_holds_its_last_value(stage):
+    run = check_axes(load_axes(stage()))
+    assert [each.reference.values.size for each in run.axes] == [1000, 1000]
+    assert set(run.axes[1].reference.values) == {1.0}
+    assert len(run.notes) == 1
+    assert not check_axes(load_axes(STAGE)).notes
+
+
+def test_files_of_axes_are_inputs(stage, tmp_path):
+    path = stage("    device: {seed: 1}", "    compensator: {model: x.yaml}")
+    assert tmp_path / "x.yaml" in inputs_of(path)
+    document = Document("x.yaml", "axes: wrong")
+    assert input_files(document, path) == [path]
+
+
+def test_a_file_of_a_setting_of_an_axis_is_looked_for_in_the_working_folder(
+    stage, tmp_path, monkeypatch
+):
+    (tmp_path / "shell").mkdir()
+    monkeypatch.chdir(tmp_path / "shell")
+    Path("m.yaml").write_text("x")
+    assert tmp_path / "shell/m.yaml" in [
+        each.resolve() for each in inputs_of(stage(), ["axes.x.compensator.model=m.yaml"])
+    ]
+
+
+@pytest.fixture
+def real():
+    """Return the properties of a real device with two outputs, as two axes use it."""
+    info = load_experiment(CONFIGS / "modbus_labjack_t7.yaml").device.info
+    assert not info.simulated
+    return {"x": replace(info, output="DAC0"), "y": replace(info, output="DAC1")}
+
+
+def test_two_axes_never_drive_one_output(real):
+    assert not [*same_output_problems(real)]
+    ((axis, problem),) = same_output_problems(real | {"y": real["x"]})
+    assert (axis, problem.key) == ("y", "device.output")
+    assert problem.rule.startswith("DAC0 of ")
+    assert not [*same_output_problems(real | {"y": replace(real["x"], holds=("tcp:other",))})]
+
+
+def test_real_devices_of_several_axes(real):
+    def keys(infos, rate_hz=1.0, block=1):
+        return [each.key for each in clock_problems(infos, rate_hz, block)]
+
+    rate_hz = real["x"].max_rate_hz
+    assert keys(real) == ["axes"]
+    assert keys(real, rate_hz / 2.1) == ["axes"]
+    assert keys(real, rate_hz / 1.9) == ["sample_rate_hz", "axes"]
+    fifo = {name: replace(each, buffered=True, holds=(name,)) for name, each in real.items()}
+    assert keys(fifo, block=2) == ["block", "axes"]
+    assert keys(fifo) == ["axes"]
+    assert keys(real | {"y": replace(real["y"], latency_blocks=2)}) == ["axes", "axes"]
+
+
+def test_simulated_axes_take_no_time():
+    infos = {each.axis: each.device.info for each in load_axes(STAGE)}
+    assert not [*clock_problems(infos, 200000.0, 50)]
+
+
+def test_real_axes_are_refused_together_and_run_alone(tmp_path):
+    text = (CONFIGS / "modbus_labjack_t7.yaml").read_text(encoding="utf-8")
+    path = CONFIGS / "modbus_labjack_t7.yaml"
+    assert "axes" not in text
+    (tmp_path / "models").symlink_to(CONFIGS / "models")
+    own = tmp_path / "t7.yaml"
+    own.write_text(text + "axes:\n  x: {}\n  y: {device: {output: DAC1}}\n", encoding="utf-8")
+    assert [each.key for each in refused(own)] == ["axes"]
+    assert load_experiment(own, ["axis=x"]).config == load_experiment(path).config
