@@ -161,5 +161,5 @@ def run(
     path, texts, chosen = Path(experiment), texts_of(settings), path_or_none(output)
     if not fast:
         return start_run(path, texts, chosen, overwrite, on_progress, take_over=take_over)
-    checked = checked_experiment(path, texts)
+    checked = checked_run(path, texts)
     return run_unpaced(checked, output_of(checked, chosen), overwrite=overwrite)

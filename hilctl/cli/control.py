@@ -113,7 +113,8 @@ def _status_lines(run: dict[str, Any]) -> dict[str, str]:
         lines["reference"] = f"gain {run['gain']:g}, offset {run['offset']:g}"
         if inverse := run["inverse"]:
             lines["inverse"] = inverse
-    lines["recording"] = run["recording"]
+    axes = {f"axis {name}": path for name, path in run.get("axes", {}).items()}
+    lines |= axes or {"recording": run["recording"]}
     if error := run.get("recording_error") or run.get("error"):
         lines["error"] = error
     return lines
@@ -133,7 +134,8 @@ def print_stopped(stopped: Sequence[dict[str, Any]], wait_s: float) -> None:
     for run in stopped:
         if run["ended"]:
             recorded = Path(run["recording"]).exists()  # not if it had not started yet
-            kept = f"recording: {run['recording']}" if recorded else "no recording"
+            files = ", ".join(run.get("axes", {"": run["recording"]}).values())
+            kept = f"recording: {files}" if recorded else "no recording"
             print(f"{run['name']} stopped; {kept}")
         else:
             reason = run["error"] or "stop requested"

@@ -10,6 +10,7 @@ import time
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
+from itertools import zip_longest
 from pathlib import Path
 from typing import Annotated, Any
 
@@ -21,7 +22,7 @@ from hilctl import api
 from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import HilctlError, InputError
 from hilctl.base.events import adapted_text
-from hilctl.base.formatting import unit_text
+from hilctl.base.formatting import quantity, unit_text
 from hilctl.base.subprocesses import python_command
 from hilctl.cli.console import compile_progress, console, listing, progress_bar
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
@@ -92,9 +93,9 @@ def run(
             )  # fmt: skip
             if result.stop_signal:  # a second Ctrl-C must not suppress the result
                 signal.signal(result.stop_signal, signal.SIG_IGN)
-        report, failure = _report(result, every=as_json)
-    values = run_mapping(result, report)
-    print_result(values, lambda: print_run(result, report), as_json=as_json)
+        reports, failure = _reports(result, every=as_json)
+    values = run_mapping(result, reports)
+    print_result(values, lambda: print_run(result, reports), as_json=as_json)
     if result.code == "fault" or not result.safe:
         raise typer.Exit(3)
     if failure or result.stop_signal:
@@ -115,17 +116,17 @@ def _displays(*, live: bool, watch: bool, quiet: bool) -> Iterator[Callable[[Run
         yield stack.enter_context(run_progress(quiet=quiet, addresses=addresses))
 
 
-def _report(result: RunResult, *, every: bool) -> tuple[RunReport | None, int]:
-    """Return the report of a finished run, and the exit code if it fails; otherwise 0."""
+def _reports(result: RunResult, *, every: bool) -> tuple[list[RunReport], int]:
+    """Return the reports of a finished run, and the exit code if one fails; otherwise 0."""
     try:
-        return report_of(result, every=every), 0
+        return reports_of(result, every=every), 0
     except HilctlError as error:  # not exit code 2, because the actuator has moved
         print(f"hilctl: cannot report the recording: {error}", file=sys.stderr)
-        return None, 3
+        return [], 3
     except KeyboardInterrupt:
         signal.signal(signal.SIGINT, signal.SIG_IGN)  # the result is still printed
         print("hilctl: report interrupted: see hilctl report", file=sys.stderr)
-        return None, 128 + signal.SIGINT
+        return [], 128 + signal.SIGINT
 
 
 @contextmanager
@@ -224,19 +225,27 @@ def _live_text(progress: RunProgress) -> str:
     return f"{error}{position}  late {progress.late_ticks}"
 
 
-def report_of(result: RunResult, *, every: bool) -> RunReport | None:
-    """Return the report of a finished run; that of a very long one only if ``every`` is set."""
+def reports_of(result: RunResult, *, every: bool) -> list[RunReport]:
+    """Return the report of each axis of a finished run.
+
+    There is none of a very long one unless ``every`` is set.
+    """
     wanted = every or 0 < result.samples <= _LARGEST_REPORTED
-    return api.summarize(result.path) if wanted else None
+    return [*map(api.summarize, result.recordings)] if wanted else []
 
 
-def run_mapping(result: RunResult, report: RunReport | None) -> dict[str, Any]:
-    """Return the result and report of a run as plain values."""
-    return {**(report.to_mapping() if report else {}), **result.to_mapping()}
+def run_mapping(result: RunResult, reports: Sequence[RunReport]) -> dict[str, Any]:
+    """Return the result and reports of a run as plain values; several axes are under ``axes``."""
+    found = result.to_mapping()
+    if not result.axes:
+        return {**(reports[0].to_mapping() if reports else {}), **found}
+    for own, report in zip(found["axes"].values(), reports, strict=False):
+        own |= {**report.to_mapping(), **own}
+    return found
 
 
-def print_run(result: RunResult, report: RunReport | None) -> None:
-    """Print the result of a run and its report, if there is one."""
+def print_run(result: RunResult, reports: Sequence[RunReport]) -> None:
+    """Print the result of a run with its report, or with a line per axis."""
     terminal = console()
     colour = {"completed": "green", "stopped": "yellow"}.get(result.code, "red")
     terminal.print(Text(result.code, colour) + f": {result.reason}")
@@ -250,13 +259,27 @@ def print_run(result: RunResult, report: RunReport | None) -> None:
         terminal.print(result.deadline_misses, style="bold yellow")
     if result.samples == 0:
         terminal.print("no samples recorded")
-    elif report is not None:
-        terminal.print(render_report(report))
+    elif result.axes:
+        terminal.print(listing("", _axis_rows(result, reports)))
+    elif reports:
+        terminal.print(render_report(reports[0]))
     elif result.adapted:
         terminal.print(f"adapted: {adapted_text(result.adapted)}")
-    terminal.print(f"recorded: {result.path}", soft_wrap=True)
+    for recording in result.recordings:
+        terminal.print(f"recorded: {recording}", soft_wrap=True)
     path = shlex.quote(str(result.path))
     terminal.print(f"  hilctl report {path} --html run.html", soft_wrap=True)
+
+
+def _axis_rows(result: RunResult, reports: Sequence[RunReport]) -> Iterator[tuple[str, ...]]:
+    """Yield a row for each axis: its samples, and the errors of its report."""
+    for (name, axis), report in zip_longest(result.axes.items(), reports):
+        missing = f", {axis.missing:,} missing" if axis.missing else ""
+        errors = ""
+        if report is not None and report.peak_error_percent is not None:
+            peak, rms = report.peak_error_percent, report.rms_error_percent
+            errors = f"error {quantity(peak, '%')} peak, {quantity(rms, '%')} rms"
+        yield name, f"{axis.samples:,} samples{missing}", errors
 
 
 def print_forecast(checked: CheckedRun) -> None:

@@ -104,10 +104,18 @@ class AxisChain:
         self._interlocks.begin_at(output)
         return self.limiter.ramp_samples
 
-    def begin_lead_in(self, ramp_samples: int) -> int:
-        """Set the samples of the slowest axis' ramp; return the samples before the waveform."""
-        self.lead_in = LeadIn(self.plan.conditioning, ramp_samples)
-        return self.lead_in.waveform_at
+    @property
+    def conditioning_samples(self) -> int:
+        """Samples of the conditioning and the rest after it; 0 without one."""
+        conditioning = self.plan.conditioning
+        return 0 if conditioning is None else conditioning.command.size
+
+    def begin_lead_in(self, waveform_at: int) -> None:
+        """Set the samples before the waveform, in which all axes ramp, then condition.
+
+        An axis with a shorter conditioning rests at the safe value before it.
+        """
+        self.lead_in = LeadIn(self.plan.conditioning, waveform_at - self.conditioning_samples)
 
     def pass_over(self, start: int, stop: int) -> None:
         """Feed the skipped samples ``start`` to ``stop`` of the waveform to the compensator.
@@ -161,10 +169,13 @@ class AxisChain:
         return self.limiter.ramp(block.command[n:], block.flags[n:], block.skipped * on_ramp)
 
     def condition(self, sample: int) -> None:
-        """Fill the block with the conditioning."""
+        """Fill the block with the conditioning, or with the safe value before it."""
         block = self.block
         block.reference[:] = block.input_um[:] = np.nan
-        self.lead_in.condition(block.wanted, sample)
+        if sample < self.lead_in.condition_at:
+            block.wanted[:] = self.limiter.limits.safe
+        else:
+            self.lead_in.condition(block.wanted, sample)
         block.flags |= _CONDITION
         self.invalid = self.limiter.limit(block.wanted, block.command, block.flags)
 
@@ -240,12 +251,13 @@ class AxisChain:
             self.lane.record_event(event)
         self._tuner.move(tuning)
 
-    def record_ramp(self) -> None:
+    def record_ramp(self, samples: int) -> None:
         """Record the initial ramp, if there is one."""
-        limiter = self.limiter
-        if not limiter.at_rest:
-            event = self.lead_in.ramp_event(limiter.last, limiter.limits.safe)
-            self.lane.record_event(event)
+        output, safe = self.limiter.last, self.limiter.limits.safe
+        if not self.limiter.at_rest:
+            values = {"output": output, "samples": float(samples)}
+            text = f"output was at {output:g}: ramp to {safe:g} first"
+            self.lane.record_event(Event(0, "info", "start_ramp", text, values))
 
     def record_condition(self) -> None:
         """Record the start of the conditioning, if there is one."""

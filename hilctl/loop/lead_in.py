@@ -41,15 +41,15 @@ class Conditioning:
 
 
 class LeadIn:
-    """Samples of a run before its waveform: a ramp of whole blocks, then the conditioning.
+    """Samples of a run before its waveform: ramp or rest in whole blocks, then the conditioning.
 
     At rest it measures the offset between sensor and model, which is then subtracted from the
     compensator's input or from the readings.
     """
 
-    def __init__(self, conditioning: Conditioning | None, ramp_samples: int) -> None:
-        self.condition_at = self.waveform_at = ramp_samples
-        """First samples of the conditioning and of the waveform."""
+    def __init__(self, conditioning: Conditioning | None, condition_at: int) -> None:
+        self.condition_at = condition_at
+        """First sample of the conditioning."""
         self._conditioning = conditioning
         self._rest = 0, 0
         self._sum_um, self._count = 0.0, 0
@@ -58,17 +58,10 @@ class LeadIn:
         self.zero_um: float | None = None
         """Offset that is subtracted from the readings; None without one."""
         if conditioning is not None:
-            self.waveform_at += conditioning.command.size
             first, stop = conditioning.rest
-            self._rest = ramp_samples + first, ramp_samples + stop
+            self._rest = condition_at + first, condition_at + stop
             way = np.arange(1, conditioning.lead_in + 1) / conditioning.lead_in
             self._rise: F64 = 0.5 * (1.0 - np.cos(np.pi * way))
-
-    def ramp_event(self, output: float, safe: float) -> Event:
-        """Return the event of the initial ramp."""
-        values = {"output": output, "samples": float(self.condition_at)}
-        text = f"output was at {output:g}: ramp to {safe:g} first"
-        return Event(0, "info", "start_ramp", text, values)
 
     def condition_event(self) -> Event | None:
         """Return the event of the conditioning cycle; None without one."""

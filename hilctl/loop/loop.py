@@ -101,7 +101,10 @@ class Loop:
         plan, block, chains = self._plan, self._plan.block, self._chains
         slowest = max(each.begin_at(at) for each, at in zip(chains, outputs, strict=True))
         self._condition_at = -(-slowest // block) * block
-        self._waveform_at = max(each.begin_lead_in(self._condition_at) for each in chains)
+        longest = max(each.conditioning_samples for each in chains)
+        self._waveform_at = self._condition_at + longest
+        for chain in chains:
+            chain.begin_lead_in(self._waveform_at)
         self._end = self._waveform_at + plan.samples
         if (triggers := plan.triggers) is not None:
             if plan.waits and self._condition_at:
@@ -124,7 +127,7 @@ class Loop:
         """
         chains = self._chains
         for chain in chains if self._phase is _STARTING else ():
-            chain.record_ramp()
+            chain.record_ramp(self._condition_at)
         for chain in chains if self._phase is _CONDITIONING else ():
             chain.record_condition()
         try:

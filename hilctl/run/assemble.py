@@ -1,4 +1,4 @@
-"""The plan of the loop, from a checked experiment."""
+"""The plan of the loop, from the checked experiments of its axes."""
 
 import math
 from collections.abc import Sequence
@@ -16,7 +16,7 @@ from hilctl.loop.pacer import LateRules
 from hilctl.loop.plan import AxisPlan, LoopPlan
 
 
-def assemble(
+def axis_plan(
     loaded: LoadedExperiment,
     reference: F64,
     input_um: F64,
@@ -24,16 +24,13 @@ def assemble(
     conditioning: Conditioning | None = None,
     *,
     operator: DisplacementOperator | None = None,
-    paced: bool = True,
     heat_a2: float = 0.0,
-    segments: Sequence[Segment] = (),
-) -> LoopPlan:
-    """Return the plan of a run, with a warmed-up compensator.
+) -> AxisPlan:
+    """Return the plan of an axis, with a warmed-up compensator.
 
     ``reference`` is in the waveform's unit, ``input_um`` is the compensator's input, float64[n]
-    each. ``state`` is the compensator's before the first sample; None: at rest. No tick is late
-    without ``paced``. ``heat_a2`` is the heat of the coil before the run, in A^2. ``segments`` are
-    those of the waveform, for the marks of ``trigger.output``.
+    each. ``state`` is the compensator's before the first sample; None: at rest. ``heat_a2`` is the
+    heat of the coil before the run, in A^2.
     """
     config, rig = loaded.config, loaded.rig
     rate_hz = config.sample_rate_hz
@@ -41,8 +38,7 @@ def assemble(
     compensator.warm_up()
     if state is not None:
         compensator.restore(state)
-    ticks = math.ceil(reference.size / config.block)
-    axis = AxisPlan(
+    return AxisPlan(
         reference=reference,
         input_um=input_um,
         compensator=compensator,
@@ -52,12 +48,29 @@ def assemble(
         feedback=make_feedback(config.feedback, rig.exchange, compensator.preview),
         adaptation=make_adaptation(config.adaptation, operator, rate_hz, compensator.preview),
         conditioning=conditioning,
+        name=loaded.axis,
     )
+
+
+def assemble(
+    loaded: LoadedExperiment,
+    axes: Sequence[AxisPlan],
+    *,
+    paced: bool = True,
+    segments: Sequence[Segment] = (),
+) -> LoopPlan:
+    """Return the plan of a run from those of its axes.
+
+    ``loaded`` is the experiment of the first axis. No tick is late without ``paced``. ``segments``
+    are those of its waveform, for the marks of ``trigger.output``.
+    """
+    config, rig = loaded.config, loaded.rig
+    ticks = math.ceil(axes[0].reference.size / config.block)
     return LoopPlan(
-        axes=(axis,),
+        axes=tuple(axes),
         block=config.block,
         latency_blocks=rig.exchange.latency_blocks,
-        sample_rate_hz=rate_hz,
+        sample_rate_hz=config.sample_rate_hz,
         late_policy=late_policy(rig.info) if paced else "catch_up",
         late_rules=late_rules(config.timing, config.tick_s, ticks) if paced else LateRules(),
         triggers=None if config.trigger is None else config.trigger.of(segments),

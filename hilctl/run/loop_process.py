@@ -10,6 +10,8 @@ import signal
 import sys
 import time
 from collections.abc import Sequence
+from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -25,12 +27,18 @@ from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock
 from hilctl.loop.plan import LoopPlan
-from hilctl.loop.safe_output import LoopOutcome, SafeGoal, describe, drive_to_safe
+from hilctl.loop.safe_output import (
+    LoopOutcome,
+    SafeGoal,
+    describe,
+    drive_all_to_safe,
+    joint_state,
+)
 from hilctl.loop.tuning import LinearBypass, Tuning
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.machine.rt_setup import SetUpStep, be_ordinary, prepare, refusals, require, step_facts
-from hilctl.run.assemble import assemble
-from hilctl.run.job import Job
+from hilctl.run.assemble import assemble, axis_plan
+from hilctl.run.job import AxisJob, Job
 from hilctl.run.run_folder import GUARDIAN, keep_removed
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, SharedPage, Stop
@@ -128,102 +136,129 @@ class RingHost:
         return os.getppid() == self._supervisor
 
 
-def loaded_of(job: Job) -> LoadedExperiment:
-    """Return the experiment of a job; nothing is read from disk."""
-    return resolve(job.document(), Path(job.folder), files=TextFiles(job.files))
+def loaded_of(axis: AxisJob) -> LoadedExperiment:
+    """Return the experiment of an axis; nothing is read from disk."""
+    loaded = resolve(axis.document(), Path(axis.folder), files=TextFiles(axis.files))
+    return replace(loaded, axis=axis.axis)
 
 
-def plan_of(job: Job, loaded: LoadedExperiment) -> LoopPlan:
+def plan_of(job: Job, loaded: Sequence[LoadedExperiment]) -> LoopPlan:
     """Return the plan of a job."""
-    reference, input_um = job.arrays()
-    return assemble(
-        loaded,
-        reference,
-        input_um,
-        None if job.state is None else np.array(job.state),
-        loaded.conditioning(job.stands_um),
-        operator=None if job.adapted is None else DisplacementOperator.from_lists(job.adapted),
-        heat_a2=job.heat_a2,
-        segments=[Segment(**each) for each in job.segments],
-    )
+    axes = []
+    for axis, each in zip(job.axes, loaded, strict=True):
+        operator = None if axis.adapted is None else DisplacementOperator.from_lists(axis.adapted)
+        plan = axis_plan(
+            each,
+            *axis.arrays(),
+            None if axis.state is None else np.array(axis.state),
+            each.conditioning(axis.stands_um),
+            operator=operator,
+            heat_a2=axis.heat_a2,
+        )
+        axes.append(plan)
+    return assemble(loaded[0], axes, segments=[Segment(**each) for each in job.segments])
 
 
-def run_job(job: Job, ring: SampleRing) -> LoopOutcome:
-    """Run a job, from set-up to the closed device; an error leaves a moved output safe."""
-    loaded = loaded_of(job)
-    config, device, page = loaded.config, loaded.device, ring.page
-    host = RingHost([ring], SystemClock(), job.supervisor, job.silence_s)
+def run_job(job: Job, rings: Sequence[SampleRing]) -> LoopOutcome:
+    """Run a job, from set-up to the closed devices; an error leaves moved outputs safe."""
+    loaded = [loaded_of(each) for each in job.axes]
+    config, page = loaded[0].config, rings[0].page
+    devices = [each.device for each in loaded]
+    host = RingHost(rings, SystemClock(), job.supervisor, job.silence_s)
     plan = plan_of(job, loaded)
-    loop = Loop(plan, [device], host)
-    # After the warm-up, so that all its memory is locked; before the device is opened, so that a
+    loop = Loop(plan, devices, host)
+    # After the warm-up, so that all its memory is locked; before a device is opened, so that a
     # refusal moves nothing.
     steps = prepare(config.realtime)
     if config.realtime.require:
         require(steps)
-    start_ns = _start(loop, loaded, page, host, steps)
+    start_ns = _start(loop, loaded, rings, host, steps)
     try:
         if not plan.waits:  # until it starts, arming and readings are no hang
             page.publish(PageField.PHASE, Phase.RUNNING)
         before = ProcessUsage.now()
         outcome = loop.run(start_ns)
         page.leave_usage(ProcessUsage.now().since(before))
-        # Before the device is closed, which may take its timeouts and is no hang.
+        # Before the devices are closed, which may take their timeouts and is no hang.
         host.closing()
     except BaseException as error:
-        _make_safe(job, device, ring, error)
+        _make_safe(job, devices, rings, error)
         raise
     finally:
-        device.close()
+        close_all(devices)
         page.leave_lateness(loop.lateness)
     return outcome
 
 
 def _start(
     loop: Loop,
-    loaded: LoadedExperiment,
-    page: SharedPage,
+    loaded: Sequence[LoadedExperiment],
+    rings: Sequence[SampleRing],
     host: RingHost,
     steps: Sequence[SetUpStep],
 ) -> int:
-    """Open the device, report that the loop is ready, and return the time of the start signal.
+    """Open the devices, report that the loop is ready, and return the time of the start signal.
 
-    An error closes the device without a safe value: nothing has moved, and the output must not
-    jump.
+    An error closes them without a safe value: nothing has moved, and no output must jump.
     """
-    config, device = loaded.config, loaded.device
-    known = device.info.details
+    config, page = loaded[0].config, rings[0].page
+    devices = [each.device for each in loaded]
+    known = [each.info.details for each in devices]
     page.publish(PageField.AWAITS_DEVICE, 1)
     _await(PageField.HAS_DEVICE, page, host)
-    device.open(config.sample_rate_hz, config.block)
+    opened: list[Device] = []
     try:
-        output = starting_output(device, config.safe.at_start)
-        waveform_at = loop.begin_at([output])
-        page.put_float(PageField.OUTPUT_AT_START, output)
+        for device in devices:
+            device.open(config.sample_rate_hz, config.block)
+            opened.append(device)
+        outputs = [starting_output(each.device, each.config.safe.at_start) for each in loaded]
+        waveform_at = loop.begin_at(outputs)
         fifo = any(each.name == "fifo" and each.outcome == "done" for each in steps)
         page.put(PageField.REAL_TIME, int(fifo))
-        page.put(PageField.WAVEFORM_AT, waveform_at)
-        details = device.info.details.items()
-        learned = {f"device.{key}": value for key, value in details if key not in known}
-        facts = step_facts(steps) | learned
-        page.write_text(PageSlot.SET_UP, json.dumps([facts, refusals(steps)]))
+        learned = []
+        for ring, output, device, before in zip(rings, outputs, devices, known, strict=True):
+            ring.page.put_float(PageField.OUTPUT_AT_START, output)
+            ring.page.put(PageField.WAVEFORM_AT, waveform_at)
+            details = device.info.details.items()
+            learned.append({f"device.{key}": value for key, value in details if key not in before})
+        text = json.dumps([step_facts(steps), learned, refusals(steps)])
+        page.write_text(PageSlot.SET_UP, text)
         # After the text, which the phase announces.
         page.publish(PageField.PHASE, Phase.READY)
         _await(PageField.GO, page, host)
         return page.get(PageField.START_NS)
     except BaseException:
-        device.close()
+        close_all(opened)
         raise
 
 
-def _make_safe(job: Job, device: Device, ring: SampleRing, error: BaseException) -> None:
-    """Drive the output to its safe value after an error; raise RunError if it is not confirmed."""
-    pending = bool(ring.page.get(PageField.EXCHANGING)) and not device.info.simulated
-    goal = SafeGoal(job.safe_value, job.ramp_per_s, ring.last_command(), pending)
-    found = drive_to_safe(device, goal, on_write=ring.page.note_safe_write)
-    if found.state != "confirmed":
+def close_all(devices: Sequence[Device]) -> None:
+    """Close devices; the error of one does not keep the others open."""
+    with ExitStack() as stack:
+        for device in reversed(devices):
+            stack.callback(device.close)
+
+
+def _make_safe(
+    job: Job, devices: Sequence[Device], rings: Sequence[SampleRing], error: BaseException
+) -> None:
+    """Drive the outputs to their safe values after an error; raise RunError if not confirmed."""
+    goals = [
+        SafeGoal(
+            axis.safe_value,
+            axis.ramp_per_s,
+            ring.last_command(),
+            bool(ring.page.get(PageField.EXCHANGING)) and not device.info.simulated,
+        )
+        for axis, ring, device in zip(job.axes, rings, devices, strict=True)
+    ]
+    notes = [each.page.note_safe_write for each in rings]
+    found = drive_all_to_safe(devices, goals, time.monotonic, time.sleep, notes)
+    state, why = joint_state(found, [each.axis for each in job.axes])
+    if state != "confirmed":
         # The cause first: an unreachable device is often its consequence.
         cause = str(error) if isinstance(error, HilctlError) else f"the loop broke: {error!r}"
-        raise RunError(f"{cause}; {describe(found.state, found.error)}") from error
+        raise RunError(f"{cause}; {describe(state, why)}") from error
 
 
 def _await(field: PageField, page: SharedPage, host: RingHost) -> None:
@@ -240,19 +275,20 @@ def main(words: list[str]) -> int:
         signal.signal(number, signal.SIG_IGN)  # the supervisor stops the loop
     be_ordinary()
     job = Job.read(Path(words[0]))
-    ring = SampleRing(Path(job.ring), at_once=True)
+    rings = [SampleRing(Path(each.ring), at_once=True) for each in job.axes]
+    page = rings[0].page
     try:
-        ring.page.leave_outcome(run_job(job, ring))
+        page.leave_outcome(run_job(job, rings))
     except InputError as error:  # nothing has moved
-        return _failed(ring.page, str(error), Phase.REFUSED)
+        return _failed(page, str(error), Phase.REFUSED)
     except HilctlError as error:
-        return _failed(ring.page, str(error))
+        return _failed(page, str(error))
     except Exception as error:  # noqa: BLE001  the supervisor sets the safe value
-        return _failed(ring.page, f"the loop broke: {type(error).__name__}: {error}")
+        return _failed(page, f"the loop broke: {type(error).__name__}: {error}")
     finally:
         if os.getppid() != job.supervisor:
             keep_removed()
-            _become_guardian(words[0], job, ring.page)
+            _become_guardian(words[0], job, page)
     return 0
 
 

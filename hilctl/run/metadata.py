@@ -28,6 +28,8 @@ from hilctl.machine.diagnosis import machine_facts
 from hilctl.machine.procfs import ProcessUsage
 from hilctl.recording.metadata_keys import (
     AUX_FACT,
+    AXES_FACT,
+    AXIS_FACT,
     END_FIGURES,
     HEAT_FACT,
     HOLDS_FACT,
@@ -45,14 +47,23 @@ _LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
 
 
 def run_facts(
-    checked: "CheckedExperiment", started: str, model_yaml: str, correction_yaml: str = ""
+    checked: "CheckedExperiment",
+    started: str,
+    model_yaml: str,
+    correction_yaml: str = "",
+    *,
+    run_id: str = "",
+    axes: Sequence[str] = (),
 ) -> dict[str, str]:
-    """Return identity, versions, device and units as text; rates are in the layout."""
+    """Return identity, versions, device and units as text; rates are in the layout.
+
+    ``run_id`` is new if empty; ``axes`` are the names of all axes, without names if there is one.
+    """
     loaded = checked.loaded
     config, info = loaded.config, loaded.device.info
     recorded = [column.field(info.command_unit) for column in COLUMNS.values()]
     facts = {
-        "run_id": str(uuid.uuid4()),
+        "run_id": run_id or str(uuid.uuid4()),
         "name": config.name,
         "description": config.description,
         LABELS_FACT: json.dumps(config.labels, ensure_ascii=False),
@@ -77,6 +88,8 @@ def run_facts(
         for key, value in config.waveform
         if isinstance(value, str | int | float)
     }
+    if loaded.axis:
+        facts |= {AXIS_FACT: loaded.axis, AXES_FACT: json.dumps(list(axes))}
     return (
         facts
         | _software_facts()

@@ -8,8 +8,9 @@ import errno
 import logging
 import threading
 import time
+import uuid
 from collections import deque
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import replace
 from datetime import UTC, datetime
@@ -25,7 +26,7 @@ from hilctl.base.files import already_there, reason, sync_folder
 from hilctl.base.samples import BlockBatch, BlockHeader, Samples
 from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.correction import dump_correction
-from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
 from hilctl.experiment.state_files import CoilState, DeviceState, MachineTime, names_of, write_state
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.procfs import ProcessUsage
@@ -34,8 +35,9 @@ from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.metadata_keys import HEAT_FACT
 from hilctl.recording.writer import OutputFile, RecordingWriter, RunFacts
 from hilctl.run.metadata import EndFigures, end_facts, run_facts, usage_facts
+from hilctl.run.result import AxisResult
 from hilctl.run.shared.ring import SampleRing
-from hilctl.run.shared.shared_page import PageField
+from hilctl.run.shared.shared_page import PageField, SharedPage
 
 _log = logging.getLogger(__name__)
 
@@ -49,10 +51,22 @@ _KEPT = 8  # 1/8 of the ring stays readable for watchers
 
 
 class Recorder:
-    """Record one run into one file; the next flush repeats a failed write."""
+    """Record one axis of a run into one file; the next flush repeats a failed write.
 
-    def __init__(self, checked: CheckedExperiment, path: Path, *, overwrite: bool) -> None:
+    ``run_id`` and ``axes`` are those of the run, see :func:`hilctl.run.metadata.run_facts`.
+    """
+
+    def __init__(
+        self,
+        checked: CheckedExperiment,
+        path: Path,
+        *,
+        overwrite: bool,
+        run_id: str = "",
+        axes: Sequence[str] = (),
+    ) -> None:
         self.path = path
+        self._run_id, self._axes = run_id, axes
         self.adapted: Mapping[str, float] = {}
         """Values of the last event of adaptation."""
         self._failed = self._problem = ""
@@ -276,7 +290,8 @@ class Recorder:
         model_yaml = dump_model(loaded.model) if loaded.model else ""
         correction_yaml = dump_correction(loaded.correction) if loaded.correction else ""
         started = iso_time(start_unix_ns)
-        facts = run_facts(self._checked, started, model_yaml, correction_yaml)
+        texts = started, model_yaml, correction_yaml
+        facts = run_facts(self._checked, *texts, run_id=self._run_id, axes=self._axes)
         return RunFacts(
             facts={**facts, **set_up},
             segments=tuple(each.shifted(waveform_at) for each in self._checked.reference.segments),
@@ -296,6 +311,32 @@ class Recorder:
                 corrects_readings=info.corrects_readings,
             ),
         )
+
+
+def recorders_of(
+    run: CheckedRun, recordings: Mapping[str, Path], *, overwrite: bool
+) -> list[Recorder]:
+    """Return a recorder per axis; raise InputError if a file cannot be written: then none is."""
+    run_id = str(uuid.uuid4())
+    made: list[Recorder] = []
+    try:
+        for checked, path in zip(run.axes, recordings.values(), strict=True):
+            made.append(Recorder(checked, path, overwrite=overwrite, run_id=run_id, axes=run.names))
+    except BaseException:
+        discard_all(made)
+        raise
+    return made
+
+
+def discard_all(recorders: Sequence[Recorder]) -> None:
+    """Remove the files of a run that does not start."""
+    for recorder in recorders:
+        recorder.discard()
+
+
+def result_of(recorder: Recorder) -> AxisResult:
+    """Return what a recorder has recorded."""
+    return AxisResult(recorder.path, recorder.samples, recorder.missing, recorder.adapted)
 
 
 class RecentSamples:
@@ -333,78 +374,43 @@ def iso_time(unix_ns: int) -> str:
     return datetime.fromtimestamp(unix_ns * 1e-9, tz=UTC).isoformat(timespec="milliseconds")
 
 
-class RingRecorder:
-    """Thread that consumes the ring until the end of the recording; its only consumer."""
+class AxisRecording:
+    """The ring of one axis, and its recorder.
 
-    def __init__(self, ring: SampleRing, recorder: Recorder, flush_s: float) -> None:
+    Args:
+        page: Page of the run.
+    """
+
+    def __init__(self, ring: SampleRing, recorder: Recorder, page: SharedPage) -> None:
         self.recorder = recorder
         self.newest: BlockBatch | None = None
         """A copy of the newest block."""
-        self._ring, self._flush_s = ring, flush_s
-        self._events: deque[Event] = deque()
+        self.events: deque[Event] = deque()
+        """Events of the supervisor."""
+        self._ring, self._page = ring, page
         self._of_loop: deque[Event] = deque()
-        self._outcome: LoopOutcome | None = None
-        self._lost_loop = False
         self._start_ns = 0
-        self._ending = threading.Event()
-        self._released_s = time.monotonic()
-        self._before = ProcessUsage.now()
-        self._thread = threading.Thread(target=self._run, name="recorder")
 
-    def start(self, start_ns: int) -> None:
-        """Start the thread, for a run that begins at a monotonic time."""
+    def begin(self, start_ns: int) -> None:
+        """Note the monotonic start of the run."""
         self._start_ns = start_ns
-        self._before = ProcessUsage.now()
-        self._released_s = time.monotonic()
-        self._thread.start()
 
-    def record_event(self, event: Event) -> None:
-        """Queue an event of the supervisor."""
-        self._events.append(event)
-
-    def end(self, outcome: LoopOutcome, *, lost_loop: bool) -> None:
-        """Let the thread drain the ring and close the recording."""
-        self._outcome, self._lost_loop = outcome, lost_loop
-        self._ending.set()
-
-    @property
-    def takes_marks(self) -> bool:
-        """Whether marks are accepted: few events are waiting, and the file is writable."""
-        waiting = len(self._events) >= _MOST_WAITING
-        return not (waiting or self._ending.is_set() or self.recorder.error)
-
-    @property
-    def finished(self) -> bool:
-        """Whether the recording is closed."""
-        return not self._thread.is_alive()
-
-    def stalled_s(self) -> float:
-        """Return the time since the ring was last released."""
-        return time.monotonic() - self._released_s
-
-    def _run(self) -> None:
-        self._guarded(self.recorder.note_device)
-        while not self._ending.wait(_POLL_S):
-            self._guarded(self._work)
-        self._guarded(self._finish)
-
-    def _guarded(self, work: Callable[[], None]) -> None:
-        """Call a function; its error becomes an error of the recording."""
+    def guarded(self, work: Callable[[], object]) -> bool:
+        """Call a function; return whether it succeeds. Its error is one of the recording."""
         try:
-            work()
+            return work() is not False
         except Exception as error:  # noqa: BLE001  later samples are counted as missing
             self.recorder.fail(f"{type(error).__name__}: {error}")
+            return False
 
-    def _work(self) -> None:
-        self._drain()
-        if self.stalled_s() < self._flush_s:
-            return
-        # Released only after the file contains the samples.
-        if self.recorder.flush():
-            self._ring.release(keep=self._ring.slots // _KEPT)
-            self._released_s = time.monotonic()
+    def release(self) -> bool:
+        """Flush the file, and release the ring; return whether the file has all samples."""
+        if not self.recorder.flush():
+            return False
+        self._ring.release(keep=self._ring.slots // _KEPT)
+        return True
 
-    def _drain(self) -> bool:
+    def drain(self, *, ending: bool) -> bool:
         """Record all new samples and events; return whether there were samples."""
         page, recorder = self._ring.page, self.recorder
         took = False
@@ -415,39 +421,133 @@ class RingRecorder:
             self._record(batch)
             took = True
         # Before the first sample the start may still be postponed, which writes the file again.
-        if self.newest is None and not self._ending.is_set():
+        if self.newest is None and not ending:
             return took
         # After the samples: an event is recorded with the samples before it.
         while self._of_loop:
             recorder.event(self._of_loop.popleft())
-        while self._events:
-            event = self._events.popleft()
+        while self.events:
+            event = self.events.popleft()
             recorder.event(event)
             page.leave_note(event)
         return took
 
+    def finish(self, outcome: LoopOutcome, before: ProcessUsage, *, lost_loop: bool) -> None:
+        """Drain the ring, and close the recording with the outcome of the run.
+
+        ``before`` is the usage of this process at the start of the run.
+        """
+        page, recorder = self._ring.page, self.recorder
+        self._drain_all()
+        while self._ring.skip_damaged():
+            self._drain_all()
+        if lost_loop:
+            if (batch := self._ring.unanswered(recorder.next_sample)) is not None:
+                self._record(batch)
+            ended_at = max(recorder.next_sample, page.get(PageField.ENDED_AT))
+            outcome = replace(outcome, ended_at=ended_at)
+        facts = end_facts(outcome, self._page.lateness(), page.get(PageField.EVENTS_LOST))
+        facts |= usage_facts(self._page.usage(), ProcessUsage.now().since(before))
+        recorder.finish(facts, outcome.ended_at)
+
     def _record(self, batch: BlockBatch) -> None:
         """Record a batch, after the time of a start that was postponed."""
-        if (later_ns := self._ring.page.get(PageField.START_NS) - self._start_ns) > 0:
+        if (later_ns := self._page.get(PageField.START_NS) - self._start_ns) > 0:
             self.recorder.postpone(later_ns)
             self._start_ns += later_ns
         self.recorder.batch(batch)
 
     def _drain_all(self) -> None:
-        while self._drain():
+        while self.drain(ending=True):
             pass
 
+
+class RingRecorder:
+    """Thread that consumes the rings of a run until the end of its recordings.
+
+    It is their only consumer. The first ring has the page of the run.
+    """
+
+    def __init__(
+        self, rings: Sequence[SampleRing], recorders: Sequence[Recorder], flush_s: float
+    ) -> None:
+        self.recorders = recorders
+        self._page, self._flush_s = rings[0].page, flush_s
+        self._axes = [
+            AxisRecording(*each, self._page) for each in zip(rings, recorders, strict=True)
+        ]
+        self._outcome: LoopOutcome | None = None
+        self._lost_loop = False
+        self._ending = threading.Event()
+        self._released_s = time.monotonic()
+        self._before = ProcessUsage.now()
+        self._thread = threading.Thread(target=self._run, name="recorder")
+
+    def start(self, start_ns: int) -> None:
+        """Start the thread, for a run that begins at a monotonic time."""
+        for axis in self._axes:
+            axis.begin(start_ns)
+        self._before = ProcessUsage.now()
+        self._released_s = time.monotonic()
+        self._thread.start()
+
+    def record_event(self, event: Event) -> None:
+        """Queue an event of the supervisor."""
+        for axis in self._axes:
+            axis.events.append(event)
+
+    def end(self, outcome: LoopOutcome, *, lost_loop: bool) -> None:
+        """Let the thread drain the rings and close the recordings."""
+        self._outcome, self._lost_loop = outcome, lost_loop
+        self._ending.set()
+
+    @property
+    def newest(self) -> BlockBatch | None:
+        """A copy of the newest block of the first axis."""
+        return self._axes[0].newest
+
+    @property
+    def error(self) -> str:
+        """Why a file cannot be written now; may be empty."""
+        return next(filter(None, (each.error for each in self.recorders)), "")
+
+    @property
+    def takes_marks(self) -> bool:
+        """Whether marks are accepted: few events are waiting, and the files are writable."""
+        waiting = any(len(each.events) >= _MOST_WAITING for each in self._axes)
+        return not (waiting or self._ending.is_set() or self.error)
+
+    @property
+    def finished(self) -> bool:
+        """Whether the recordings are closed."""
+        return not self._thread.is_alive()
+
+    def stalled_s(self) -> float:
+        """Return the time since all rings were last released."""
+        return time.monotonic() - self._released_s
+
+    def _run(self) -> None:
+        for axis in self._axes:
+            axis.guarded(axis.recorder.note_device)
+        while not self._ending.wait(_POLL_S):
+            self._work()
+        self._finish()
+
+    def _drain(self) -> None:
+        for axis in self._axes:
+            axis.guarded(partial(axis.drain, ending=self._ending.is_set()))
+
     def _finish(self) -> None:
-        outcome, page, recorder = self._outcome, self._ring.page, self.recorder
+        outcome = self._outcome
         assert outcome is not None
-        self._drain_all()
-        while self._ring.skip_damaged():
-            self._drain_all()
-        if self._lost_loop:
-            if (batch := self._ring.unanswered(recorder.next_sample)) is not None:
-                self._record(batch)
-            ended_at = max(recorder.next_sample, page.get(PageField.ENDED_AT))
-            outcome = replace(outcome, ended_at=ended_at)
-        facts = end_facts(outcome, page.lateness(), page.get(PageField.EVENTS_LOST))
-        facts |= usage_facts(page.usage(), ProcessUsage.now().since(self._before))
-        recorder.finish(facts, outcome.ended_at)
+        for axis in self._axes:
+            axis.guarded(partial(axis.finish, outcome, self._before, lost_loop=self._lost_loop))
+
+    def _work(self) -> None:
+        self._drain()
+        if self.stalled_s() < self._flush_s:
+            return
+        # Released only after the files contain the samples.
+        released = [axis.guarded(axis.release) for axis in self._axes]
+        if all(released):
+            self._released_s = time.monotonic()

@@ -28,7 +28,7 @@ _POLL_S = 0.02
 
 @dataclass(frozen=True, slots=True)
 class RecoveredRun:
-    """A dead run that another command has finished."""
+    """A dead run that another command has finished: one axis of it."""
 
     name: str
     recording: Path
@@ -41,10 +41,11 @@ class RecoveredRun:
 def recover_dead_runs() -> list[RecoveredRun]:
     """Finish the recordings of all runs of this user whose supervisor and loop are dead.
 
+    Each recording has its own result.
     A guardian may still be active. The folder of a run stays for it, or until another command has
     made an unsafe output safe.
     """
-    found = []
+    found: list[RecoveredRun] = []
     for run in runs():
         if run.recorded and not run.alive and _is_settled(run):
             run.remove()
@@ -53,10 +54,11 @@ def recover_dead_runs() -> list[RecoveredRun]:
         _await_guardian(run)
         with taken_over(run) as ours, _undisturbed():
             if ours:
-                found.append(recovered := _recover(run))
-                if recovered.kept is None:
-                    finish_state(recovered.recording, MachineTime.now())
-                    _finish(run, recovered)
+                found += (recovered := _recover(run))
+                if all(each.kept is None for each in recovered):
+                    for each in recovered:
+                        finish_state(each.recording, MachineTime.now())
+                    _finish(run, recovered[0])
     return found
 
 
@@ -83,8 +85,14 @@ def _finish(run: RunFolder, recovered: RecoveredRun) -> None:
 
 def _page(run: RunFolder) -> SharedPage | None:
     """Return the page of a run; None if its ring is missing or damaged."""
+    ring = _ring(run, 0)
+    return None if ring is None else ring.page
+
+
+def _ring(run: RunFolder, number: int) -> SampleRing | None:
+    """Return the ring of an axis by its number; None if it is missing or damaged."""
     with suppress(OSError, ValueError):
-        return SampleRing(run.ring).page
+        return SampleRing(run.ring_of(number))
     return None
 
 
@@ -94,30 +102,60 @@ def _is_settled(run: RunFolder) -> bool:
     return page is None or page.is_settled()
 
 
-def _recover(run: RunFolder) -> RecoveredRun:
-    path = Path(run.card.recording)
-    if not _has_started(run, path):
-        _remove_claimed(path)
-        return RecoveredRun(run.card.name, path, True, "nothing has moved", started=False)
-    outcome, batches, events, end = _left_behind(run)
+def _recover(run: RunFolder) -> list[RecoveredRun]:
+    """Finish the recording of each axis of a dead run."""
+    page, name, paths = _page(run), run.card.name, run.card.recordings
+    if not any(_has_started(page, path) for path in paths):
+        for path in paths:
+            _remove_claimed(path)
+        return [
+            RecoveredRun(name, path, True, "nothing has moved", started=False) for path in paths
+        ]
+    outcome = _DIED if page is None else _outcome_of(page)
     where = "at its safe value" if outcome.safe else "NOT confirmed to be safe: check it"
-    page = _page(run)
+    text = f"{outcome.reason}; output {where}"
     if page is not None and page.get(PageField.RECORDED):
-        return RecoveredRun(run.card.name, path, outcome.safe, f"{outcome.reason}; output {where}")
+        return [RecoveredRun(name, path, outcome.safe, text) for path in paths]
+    found = []
+    for number, path in enumerate(paths):
+        lost, kept = _recover_axis(_ring(run, number), page, outcome, path)
+        folder = run.path if kept else None
+        found.append(RecoveredRun(name, path, outcome.safe, f"{text}; {lost}", folder))
+    return found
+
+
+def _recover_axis(
+    ring: SampleRing | None, page: SharedPage | None, outcome: LoopOutcome, path: Path
+) -> tuple[str, bool]:
+    """Finish the recording of an axis; return what is lost, and whether its ring must be kept.
+
+    ``page`` is that of the run.
+    """
+    batches: list[BlockBatch] = []
+    events: list[Event] = []
+    if ring is None or page is None:
+        end = {
+            "code": _DIED.code,
+            "reason": _DIED.reason,
+            "output_safe": "false",
+            "output_state": _DIED.output,
+        }
+    else:
+        batches = _batches_in(ring, ended=page.observe(PageField.PHASE) == Phase.ENDED)
+        events = ring.page.pop_events()
+        end = end_facts(outcome, page.lateness(), ring.page.get(PageField.EVENTS_LOST))
     try:
         recovered = recover_recording(path, batches, end, events=events, ended_at=outcome.ended_at)
-        text = f"{outcome.reason}; output {where}; {recovered.samples} samples: {recovered.reason}"
     except (HilctlError, OSError) as error:
         left = sum(batch.flags.size for batch in batches)
-        text = f"{outcome.reason}; output {where}; {left} samples are only in memory, because its "
-        text += f"recording could not be recovered: {error}"
-        return RecoveredRun(run.card.name, path, outcome.safe, text, run.path)
-    return RecoveredRun(run.card.name, path, outcome.safe, text)
+        text = f"{left} samples are only in memory, because its recording could not be recovered"
+        return f"{text}: {error}", True
+    return f"{recovered.samples} samples: {recovered.reason}", False
 
 
-def _has_started(run: RunFolder, recording: Path) -> bool:
-    page = _page(run)
-    if page is None:  # the ring is created before the recording is written
+def _has_started(page: SharedPage | None, recording: Path) -> bool:
+    """Return whether a run had started; the ring is created before its recordings are written."""
+    if page is None:
         return not (recording.is_file() and recording.stat().st_size == 0)
     return bool(page.get(PageField.GO) or page.get(PageField.SENT))
 
@@ -127,26 +165,6 @@ def _remove_claimed(recording: Path) -> None:
     with suppress(OSError), recording.open("rb") as stream:
         if not stream.read(1) and not is_being_recorded(stream):
             recording.unlink()
-
-
-def _left_behind(
-    run: RunFolder,
-) -> tuple[LoopOutcome, list[BlockBatch], list[Event], dict[str, str]]:
-    """Return the outcome, blocks and events that are only in memory, and metadata of the end."""
-    try:
-        ring = SampleRing(run.ring)
-    except (OSError, ValueError):
-        end = {
-            "code": _DIED.code,
-            "reason": _DIED.reason,
-            "output_safe": "false",
-            "output_state": _DIED.output,
-        }
-        return _DIED, [], [], end
-    page, batches = ring.page, _batches_in(ring)
-    outcome, events = _outcome_of(page), page.pop_events()
-    end = end_facts(outcome, page.lateness(), page.get(PageField.EVENTS_LOST))
-    return outcome, batches, events, end
 
 
 def _outcome_of(page: SharedPage) -> LoopOutcome:
@@ -160,15 +178,15 @@ def _outcome_of(page: SharedPage) -> LoopOutcome:
     return outcome
 
 
-def _batches_in(ring: SampleRing) -> list[BlockBatch]:
-    """Return the blocks of a ring, with the one that was under way when the loop died."""
+def _batches_in(ring: SampleRing, *, ended: bool) -> list[BlockBatch]:
+    """Return the blocks of a ring, with the one that was under way unless the loop had ended."""
     batches = []
     while True:
         while (batch := ring.pop()) is not None:
             batches.append(batch)
         if not ring.skip_damaged():
             break
-    if ring.page.observe(PageField.PHASE) != Phase.ENDED:
+    if not ended:
         last = batches[-1].heads[-1] if batches else None
         next_sample = 0 if last is None else int(last[BlockHeader.FIRST_SAMPLE]) + ring.block
         if (unanswered := ring.unanswered(next_sample)) is not None:

@@ -21,9 +21,9 @@ import socket
 import struct
 import sys
 from collections import Counter
-from collections.abc import Iterator, Sequence
+from collections.abc import Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
 from typing import Any, Self
@@ -47,6 +47,7 @@ _KEPT = "kept"
 _RECORDED = "recorded"
 _SUPERVISOR = "supervisor.lock"
 _DEVICES = "devices"
+_RING = "ring"
 _REMOVED = " (deleted)"
 _PEER = struct.Struct("3i")  # process, user and group, as in unix(7)
 GUARDIAN = "hilctl.run.safety.guardian"
@@ -66,13 +67,19 @@ class RunCard:
     recording: str
     supervisor: int
     started: float  # unix time in s
-    holds: tuple[str, ...] = ()  # resources of its device, as DeviceInfo.holds
+    holds: tuple[str, ...] = ()  # resources of its devices, as DeviceInfo.holds
+    axes: Mapping[str, str] = field(default_factory=dict)  # recordings; empty with one axis
 
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Return a card; raise ValueError or TypeError if a text is not one."""
         values = {"holds": [], **json.loads(text)}
         return cls(**values | {"holds": tuple(values["holds"])})
+
+    @property
+    def recordings(self) -> list[Path]:
+        """Recordings of all axes, that of the first one first."""
+        return [Path(each) for each in [*self.axes.values()] or [self.recording]]
 
 
 @dataclass(frozen=True, slots=True)
@@ -84,8 +91,17 @@ class RunFolder:
 
     @property
     def ring(self) -> Path:
-        """File of the ring."""
-        return self._file("ring")
+        """File of the ring of the first axis, with the page of the run."""
+        return self.ring_of(0)
+
+    def ring_of(self, axis: int) -> Path:
+        """Return the file of the ring of an axis by its number."""
+        return self._file(self.file_of(_RING, axis).name)
+
+    def file_of(self, name: str, axis: int) -> Path:
+        """Return the path of a file of an axis by its number."""
+        path = self.path / name
+        return path.with_stem(f"{path.stem}-{axis}") if axis else path
 
     @property
     def description(self) -> Path:
@@ -244,27 +260,35 @@ def keep_removed() -> None:
     own = _removed_files("self")
     for card, opened in own.items():
         folder = card.parent
-        if card.name == _CARD and folder / "ring" in own and not card.exists():
+        rings = [each for each in own if each.parent == folder and each.name.startswith(_RING)]
+        if card.name == _CARD and rings and not card.exists():
             with suppress(OSError):  # no process is left to report it to
                 private_folder(private_folder(folder.parent) / folder.name)
-                shutil.copyfile(own[folder / "ring"], folder / "ring")
+                for ring in rings:
+                    shutil.copyfile(own[ring], ring)
                 shutil.copyfile(opened, folder / f"{_CARD}.new")
-                # Last: a folder with a card is a dead run, whose ring is whole.
+                # Last: a folder with a card is a dead run, whose rings are whole.
                 (folder / f"{_CARD}.new").rename(card)
                 os.truncate(opened, 0)  # the run is found once, also until this process has ended
 
 
 @contextmanager
 def run_folder(
-    experiment: str, recording: Path, started: float, holds: Sequence[str] = ()
+    experiment: str, recordings: Mapping[str, Path], started: float, holds: Sequence[str] = ()
 ) -> Iterator[tuple[RunFolder, list[int]]]:
-    """Provide a run's folder and descriptors of its locks; remove it at the end unless kept."""
+    """Provide a run's folder and descriptors of its locks; remove it at the end unless kept.
+
+    ``recordings`` are those of the axes by name; that of the only axis has an empty one.
+    """
     base, number = base_folder(), os.getpid()
-    recorded = str(recording.resolve())  # fails if the working folder was removed
+    # Fails if the working folder was removed.
+    axes = {axis: str(each.resolve()) for axis, each in recordings.items()}
+    recorded = next(iter(axes.values()))
+    axes.pop("", None)
     with ExitStack() as stack:
         try:
             path = _new_folder(base / f"{experiment}-{number}")
-            card = RunCard(path.name, experiment, recorded, number, started, tuple(holds))
+            card = RunCard(path.name, experiment, recorded, number, started, tuple(holds), axes)
             folder = RunFolder(path, card)
             stack.callback(_clear_away, folder)
             unnamed = path / f"{_CARD}.new"
@@ -535,7 +559,7 @@ def _is_locked(path: Path) -> bool:
 
 def facts_of(run: RunFolder) -> dict[str, Any]:
     """Return a run's card as plain values."""
-    return asdict(run.card)
+    return {key: value for key, value in asdict(run.card).items() if key != "axes" or value}
 
 
 def require_linux() -> None:

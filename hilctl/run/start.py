@@ -33,7 +33,7 @@ from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends
 from hilctl.run.control.client import HANG_UP, ask, finish_dead_runs, request
 from hilctl.run.metadata import experiment_sha256, sha256_of
-from hilctl.run.result import Progress, RunResult
+from hilctl.run.result import Progress, RunResult, recordings_of
 from hilctl.run.run_folder import RunFolder, require_linux, runs
 from hilctl.run.unpaced import run_unpaced
 
@@ -64,19 +64,21 @@ def checked_run(path: Path, settings: Sequence[str], heat_a2: float = 0.0) -> Ch
     return check_axes(loaded, heat_a2)
 
 
-def output_of(checked: CheckedExperiment, output: Path | None) -> Path:
+def output_of(run: CheckedRun, output: Path | None) -> Path:
     """Return the recording to write: ``output``, or a new name in the folder of recordings.
 
-    Raise InputError if the folder cannot be created, or ``output`` is an input of the run.
+    Those of several axes are named after it, see :func:`recordings_of`. Raise InputError if the
+    folder cannot be created, or a recording is an input of the run.
     """
     if output is not None:
-        loaded = checked.loaded
-        # A recording may be an input: of a waveform, or of the initial state.
-        check_no_input(output, input_files(loaded.document, loaded.folder / "experiment"))
+        for path in recordings_of(run.names, output).values():
+            for loaded in (each.loaded for each in run.axes):
+                # A recording may be an input: of a waveform, or of the initial state.
+                check_no_input(path, input_files(loaded.document, loaded.folder / "experiment"))
         return output
-    folder = Path(checked.loaded.config.recording.folder)
+    folder = Path(run.config.recording.folder)
     make_folder(folder)
-    return default_output(checked.loaded.config.name, folder, time.localtime())
+    return default_output(run.config.name, folder, time.localtime(), run.names)
 
 
 def start_run(
@@ -100,25 +102,29 @@ def start_run(
         )
     from hilctl.run.supervisor import Supervisor  # Linux only
 
-    checked = checked_experiment(path, settings, heat_a2)
+    run = checked_run(path, settings, heat_a2)
     # A real device has hysteresis memory: log the assumed initial state.
-    if checked.begun.begins and checked.loaded.device.info.holds:
-        _log.warning("the compensator begins %s", checked.begun.begins)
-    output = output_of(checked, output)
+    for checked in run.axes:
+        if checked.begun.begins and checked.loaded.device.info.holds:
+            _log.warning("the compensator begins %s", checked.begun.begins)
+    output = output_of(run, output)
     return Supervisor(
-        checked, output, overwrite=overwrite, take_over=take_over, on_progress=on_progress
+        run, output, overwrite=overwrite, take_over=take_over, on_progress=on_progress
     ).run()
 
 
-def default_output(name: str, folder: Path, now: time.struct_time) -> Path:
+def default_output(
+    name: str, folder: Path, now: time.struct_time, axes: Sequence[str] = ("",)
+) -> Path:
     """Return the default file name of a recording: ``folder/name-date-time.mcap``."""
-    return unused(folder / f"{name}-{time.strftime('%Y%m%d-%H%M%S', now)}.mcap", "-")
+    return unused(folder / f"{name}-{time.strftime('%Y%m%d-%H%M%S', now)}.mcap", "-", axes)
 
 
-def unused(path: Path, mark: str) -> Path:
-    """Return a path, with ``mark`` and a number after its stem if it exists."""
+def unused(path: Path, mark: str, axes: Sequence[str] = ("",)) -> Path:
+    """Return a path, with ``mark`` and a number after its stem if it exists for one of the axes."""
     found, number = path, 2
-    while os.path.lexists(found):  # also true of a broken link
+    # Also true of a broken link.
+    while any(map(os.path.lexists, recordings_of(axes, found).values())):
         found = path.with_stem(f"{path.stem}{mark}{number}")
         number += 1
     return found
@@ -151,8 +157,7 @@ def unpaced(
     heat_a2: float = 0.0,
 ) -> RunResult:
     """Run a simulated device without real time into a file."""
-    checked = checked_experiment(path, settings, heat_a2=heat_a2)
-    return run_unpaced(checked, output, overwrite=overwrite)
+    return run_unpaced(checked_run(path, settings, heat_a2), output, overwrite=overwrite)
 
 
 @dataclass(frozen=True, slots=True)
@@ -320,8 +325,8 @@ def start_detached(
 ) -> Detached:
     """Start ``hilctl run`` in the background; return once its loop runs, or raise its error."""
     require_linux()
-    checked = checked_experiment(experiment, settings)
-    output = output_of(checked, output)
+    run = checked_run(experiment, settings)
+    output = output_of(run, output)
     log = unused(output.with_suffix(".log"), ".")
     command = python_command("-m", "hilctl", "run", str(experiment), *flags)
     command += ["--output", str(output)]
@@ -337,7 +342,8 @@ def start_detached(
             )
     except OSError as error:
         raise InputError(f"{log}: cannot write: {error.strerror}") from None
-    return Detached(_await_running(process, log), output, log)
+    recording = next(iter(recordings_of(run.names, output).values()))
+    return Detached(_await_running(process, log), recording, log)
 
 
 def _await_running(process: "subprocess.Popen[bytes]", log: Path) -> RunFolder | None:

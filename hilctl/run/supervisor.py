@@ -11,7 +11,7 @@ import signal
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import replace
 from functools import cache, partial
@@ -21,7 +21,7 @@ from types import FrameType
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.base.formatting import encodable
-from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
 from hilctl.loop.pacer import deadline_misses
 from hilctl.loop.safe_output import LoopOutcome, describe
 from hilctl.machine.rt_setup import be_ordinary, favoured
@@ -30,8 +30,8 @@ from hilctl.run.control.requests import ControlServer, Requests
 from hilctl.run.job import Job
 from hilctl.run.metadata import RunDescription
 from hilctl.run.processes import GuardianProcess, GuardianRelief, LoopProcess
-from hilctl.run.recorder import Recorder, RingRecorder
-from hilctl.run.result import Progress, RunResult
+from hilctl.run.recorder import Recorder, RingRecorder, discard_all, recorders_of, result_of
+from hilctl.run.result import Progress, RunResult, recordings_of
 from hilctl.run.run_folder import DeviceLocks, RunFolder, run_folder
 from hilctl.run.safety.safety_monitor import SafetyMonitor
 from hilctl.run.shared.ring import SampleRing
@@ -130,13 +130,13 @@ class RunMonitor:
     def __init__(
         self,
         checked: CheckedExperiment,
-        ring: SampleRing,
+        page: SharedPage,
         child: LoopProcess,
         safety: SafetyMonitor,
         recording: RingRecorder,
     ) -> None:
         self._config, self._forecast = checked.loaded.config, checked.forecast
-        self._page, self._child = ring.page, child
+        self._page, self._child = page, child
         self._safety, self._recording = safety, recording
         self.outcome: LoopOutcome | None = None
         """Outcome of the run; None until the output is safe or nothing more can be done."""
@@ -173,7 +173,7 @@ class RunMonitor:
         if (newest := self._recording.newest) is None:
             return None
         return Progress(
-            samples=self._recording.recorder.samples,
+            samples=self._recording.recorders[0].samples,
             total=self._forecast.samples,
             late_ticks=self._page.get(PageField.LATE_TICKS),
             compensated=self._config.compensator is not None,
@@ -223,7 +223,7 @@ class RunMonitor:
             page.put(PageField.STOP, Stop.SUPERVISOR_BROKE)
         elif must_record and self._recording.stalled_s() > self._config.recording.ring_s / 2.0:
             # Not at the first error: a retry loses nothing while the ring is less than half full.
-            failed = bool(self._recording.recorder.error)
+            failed = bool(self._recording.error)
             page.put(PageField.STOP, Stop.RECORDER_FAILED if failed else Stop.RECORDER_STALLED)
 
 
@@ -240,11 +240,15 @@ def _refuse_suspend(number: int, frame: FrameType | None) -> None:
 
 
 class Supervisor:
-    """Run one checked experiment into one recording."""
+    """Run one checked run into a recording per axis.
+
+    Args:
+        output: Recording of the only axis, or the name from which those of the axes are made.
+    """
 
     def __init__(
         self,
-        checked: CheckedExperiment,
+        checked: CheckedRun,
         output: Path,
         *,
         overwrite: bool,
@@ -253,8 +257,8 @@ class Supervisor:
     ) -> None:
         self._checked = checked
         self._take_over = take_over
-        self._config = checked.loaded.config
-        self._output = output
+        self._config = checked.config
+        self._recordings = recordings_of(checked.names, output)
         self._overwrite = overwrite
         self._on_progress = on_progress
         self._notifier = SystemdNotifier()
@@ -272,53 +276,54 @@ class Supervisor:
             # From before the loop starts to the very end: a signal must stop the loop, and a
             # second one must not discard the result of a run that has ended.
             stack.enter_context(self._signals())
-            holds = self._checked.loaded.device.info.holds
+            holds = self._checked.holds
             relief = GuardianRelief(holds)
             locks = stack.enter_context(DeviceLocks(holds, take_over=self._take_over))
             if not relief.runs:
                 # The device before the recording: a refused run must not touch a file.
                 locks.acquire()
-            recorder = Recorder(self._checked, self._output, overwrite=self._overwrite)
+            recorders = recorders_of(self._checked, self._recordings, overwrite=self._overwrite)
             try:
                 folder, own = stack.enter_context(
-                    run_folder(config.name, self._output, time.time(), holds)
+                    run_folder(config.name, self._recordings, time.time(), holds)
                 )
-                ring = self._make_ring(folder)
-                recording = RingRecorder(ring, recorder, config.recording.flush_s)
-                requests = Requests(self._checked, folder, ring.page, recording)
+                rings = self._make_rings(folder)
+                page = rings[0].page
+                recording = RingRecorder(rings, recorders, config.recording.flush_s)
+                requests = Requests(self._checked, folder, page, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 self._write_job(folder, locks.descriptors)
                 # Kept open: watchers find it even if the folder is removed.
                 stack.enter_context(folder.description.open("rb"))
                 inherits = locks.descriptors + own
-                child = LoopProcess(folder, ring.page, inherits)
-                run = folder, ring, child, recording
+                child = LoopProcess(folder, page, inherits)
+                run = folder, rings[0], child, recording
                 acquire = partial(relief.acquire, locks, self._raise_if_stopped)
                 safety, start_ns = self._start(stack, *run, inherits, acquire)
-                started = RunMonitor(self._checked, ring, child, safety, recording)
+                started = RunMonitor(self._checked.first, page, child, safety, recording)
             except BaseException:
-                recorder.discard()
+                discard_all(recorders)
                 raise
-            _go(ring.page, start_ns)
+            _go(page, start_ns)
             # From here on the processes of this run keep the output safe.
             relief.relieve()
             self._announce_trigger()
             self._monitor(started, server)
-            ring.page.put(PageField.RECORDED, int(not recorder.error))
+            page.put(PageField.RECORDED, int(not recording.error))
             stops = self._stops
             guarded = safety.close(lambda: self._stops > stops)
             outcome = started.outcome
             assert outcome is not None
             unsafe = bool(holds) and outcome.output in {"set", "unknown"}
-            if guarded or unsafe or recorder.error:
-                # For its guardian, the next command, or samples that are only in the ring.
-                folder.keep(recorded=not recorder.error)
-            return self._result(outcome, started.broke, recorder, ring, folder, guarded=guarded)
+            if guarded or unsafe or recording.error:
+                # For its guardian, the next command, or samples that are only in the rings.
+                folder.keep(recorded=not recording.error)
+            return self._result(outcome, started.broke, recording, page, folder, guarded=guarded)
 
     def _announce_trigger(self) -> None:
         trigger = self._config.trigger
         if trigger is not None and trigger.start is not None:
-            name = self._checked.loaded.device.info.digital_input
+            name = self._checked.first.loaded.device.info.digital_input
             awaited = name, trigger.start, trigger.timeout_s
             _log.warning("waiting until %s is %s, at most %g s", *awaited)
 
@@ -333,7 +338,7 @@ class Supervisor:
         acquire: Callable[[], None],
     ) -> tuple[SafetyMonitor, int]:
         """Wait until loop and guardian are ready, and begin the recording."""
-        page, checked = ring.page, self._checked
+        page, checked = ring.page, self._checked.first
         safety = None
         try:
             simulated = checked.loaded.device.info.simulated  # needs no guardian
@@ -342,7 +347,7 @@ class Supervisor:
             child.await_ready(lambda: self._stop_signal != 0, acquire)
             # Started after the loop, because it watches the loop's process.
             self._await_guardian(safety)
-            start_ns = self._begin(recording.recorder, page)
+            start_ns = self._begin(recording.recorders, page)
             self._raise_if_stopped()
             # Before threads are started, so that they inherit it.
             stack.enter_context(favoured(child.pid))
@@ -368,40 +373,43 @@ class Supervisor:
                 raise RunError(f"the guardian was not ready within {_GUARDIAN_READY_S:g} s")
             time.sleep(_POLL_S)
 
-    def _begin(self, recorder: Recorder, page: SharedPage) -> int:
-        """Write the start of the recording; return the monotonic time of sample 0 in ns.
+    def _begin(self, recorders: Sequence[Recorder], page: SharedPage) -> int:
+        """Write the start of the recordings; return the monotonic time of sample 0 in ns.
 
-        The file contains that time. If the disk is so slow that the time has passed, the start is
+        The files contain that time. If the disk is so slow that the time has passed, the start is
         written again with a later time; otherwise the first tick would be late.
         """
-        set_up, refused = json.loads(page.read_text(PageSlot.SET_UP))
-        info = self._checked.loaded.device.info
-        for line in [] if info.simulated else refused:
+        set_up, learned, refused = json.loads(page.read_text(PageSlot.SET_UP))
+        infos = [each.loaded.device.info for each in self._checked.axes]
+        for line in [] if infos[0].simulated else refused:
             _warn_refused(line)
-        # The watchdog is armed between the start signal and sample 0.
-        least_ns = _START_DELAY_NS + round(info.arm_s * 1e9)
+        # The watchdogs are armed between the start signal and sample 0.
+        least_ns = _START_DELAY_NS + round(sum(each.arm_s for each in infos) * 1e9)
         delay_ns = least_ns
         for _ in range(_START_TRIES):
             began_ns = time.monotonic_ns()
             start_ns = began_ns + delay_ns
-            recorder.begin(time.time_ns() + delay_ns, set_up, page.get(PageField.WAVEFORM_AT))
+            start_unix_ns, waveform_at = time.time_ns() + delay_ns, page.get(PageField.WAVEFORM_AT)
+            for recorder, facts in zip(recorders, learned, strict=True):
+                recorder.begin(start_unix_ns, set_up | facts, waveform_at)
             took_ns = time.monotonic_ns() - began_ns
             if took_ns < delay_ns // 2:
                 return start_ns
             delay_ns = least_ns + 3 * took_ns
         raise RunError(
-            f"{self._output}: the disk took {took_ns * 1e-9:.3g} s for the first bytes; "
+            f"{recorders[0].path}: the disk took {took_ns * 1e-9:.3g} s for the first bytes; "
             "nothing has moved"
         )
 
     def _monitor(self, started: RunMonitor, server: ControlServer) -> None:
         """Monitor a run until its recording is closed, also after an error in this process."""
         shown: ProgressThread | None = None
+        files = ", ".join(map(str, self._recordings.values()))
         try:
             shown = ProgressThread(started.progress, self._on_progress, started.progress_failed)
             shown.start()
             server.start()
-            self._notifier.say("READY=1", f"STATUS=recording to {self._output}")
+            self._notifier.say("READY=1", f"STATUS=recording to {files}")
             while started.poll(self._stop_signal):
                 self._notifier.alive()
                 time.sleep(_POLL_S)
@@ -455,60 +463,66 @@ class Supervisor:
             silence_s=silence_s,
         )
         job.write(folder.job)
-        RunDescription.of(self._checked).write(folder.description)
+        RunDescription.of(self._checked.first).write(folder.description)
 
-    def _make_ring(self, folder: RunFolder) -> SampleRing:
-        config, info = self._config, self._checked.loaded.device.info
-        try:
-            return SampleRing.create(
-                folder.ring,
-                slots=max(16, int(config.recording.ring_s / config.tick_s)),
-                block=config.block,
-                state_size=self._checked.state_size,
-                latency_blocks=info.latency_blocks,
-                aux=len(info.aux),
-            )
-        except OSError as error:
-            raise RunError(
-                f"{folder.ring}: cannot allocate the sample ring ({error.strerror}): reduce "
-                "recording.ring_s"
-            ) from None
+    def _make_rings(self, folder: RunFolder) -> list[SampleRing]:
+        """Return a ring per axis; the page of the first one is that of the run."""
+        config = self._config
+        rings = []
+        for number, checked in enumerate(self._checked.axes):
+            info, path = checked.loaded.device.info, folder.ring_of(number)
+            try:
+                ring = SampleRing.create(
+                    path,
+                    slots=max(16, int(config.recording.ring_s / config.tick_s)),
+                    block=config.block,
+                    state_size=checked.state_size,
+                    latency_blocks=info.latency_blocks,
+                    aux=len(info.aux),
+                )
+            except OSError as error:
+                raise RunError(
+                    f"{path}: cannot allocate the sample ring ({error.strerror}): reduce "
+                    "recording.ring_s"
+                ) from None
+            rings.append(ring)
+        return rings
 
     def _result(
         self,
         outcome: LoopOutcome,
         broken: str,
-        recorder: Recorder,
-        ring: SampleRing,
+        recording: RingRecorder,
+        page: SharedPage,
         folder: RunFolder,
         *,
         guarded: bool,
     ) -> RunResult:
         requested = self._stop_signal == STOP_SIGNAL
         stop_signal = signal.SIGTERM if requested else self._stop_signal
+        axes = dict(zip(self._checked.names, map(result_of, recording.recorders), strict=True))
         cut = ""
-        if recorder.error:
-            cut = f"; {recorder.missing} samples are not in the recording: {recorder.error}; "
+        if recording.error:
+            missing = sum(each.missing for each in axes.values())
+            cut = f"; {missing} samples are not in the recording: {recording.error}; "
             cut += f"those in memory are kept in {folder.path}: any hilctl command adds them when "
             cut += "the file can be written"
         broke = f"; the supervisor broke: {broken}" if broken else ""
         unasked = outcome.code == "stopped" and not stop_signal
-        fault = recorder.error or broken or unasked
+        fault = recording.error or broken or unasked
         code = "fault" if fault else outcome.code
-        skipped = ring.page.lateness().skipped_ticks
-        due = (recorder.samples + recorder.missing) // self._config.block
-        return RunResult(
-            path=recorder.path,
+        first = next(iter(axes.values()))
+        due = (first.samples + first.missing) // self._config.block
+        skipped = page.lateness().skipped_ticks
+        return RunResult.of(
+            axes,
             code=code,
             reason=outcome.reason + broke + cut,
             output_state=outcome.output,
             guardian_active=guarded,
             stop_signal=stop_signal if code == "stopped" else 0,
-            samples=recorder.samples,
-            missing=recorder.missing,
-            late_ticks=ring.page.get(PageField.LATE_TICKS),
+            late_ticks=page.get(PageField.LATE_TICKS),
             deadline_misses=deadline_misses(skipped, due, self._config.timing.max_missed_share),
-            adapted=recorder.adapted,
         )
 
 

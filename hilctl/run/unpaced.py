@@ -16,7 +16,7 @@ from hilctl.base.device import Clock, Device
 from hilctl.base.errors import DeviceError, HilctlError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, Samples
-from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.preflight import CheckedRun
 from hilctl.experiment.safe import starting_output
 from hilctl.loop.block import Block
 from hilctl.loop.loop import Loop
@@ -24,10 +24,10 @@ from hilctl.loop.pacer import Lateness
 from hilctl.loop.plan import AxisPlan, LoopPlan
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.loop.tuning import Tuning
-from hilctl.run.assemble import assemble
+from hilctl.run.assemble import assemble, axis_plan
 from hilctl.run.metadata import end_facts
-from hilctl.run.recorder import Recorder
-from hilctl.run.result import RunResult
+from hilctl.run.recorder import Recorder, discard_all, recorders_of, result_of
+from hilctl.run.result import RunResult, recordings_of
 
 _BLOCKS_A_BATCH = 256
 
@@ -156,62 +156,73 @@ class OfflineHost:
         return None
 
 
-def run_unpaced(checked: CheckedExperiment, output: Path, *, overwrite: bool = False) -> RunResult:
-    """Run a checked experiment on its simulated device; raise InputError for a real one."""
-    info = checked.loaded.device.info
-    if not info.simulated:
-        raise InputError(f"{info.name}: only a simulated device can run without real time")
-    recorder = Recorder(checked, output, overwrite=overwrite)
-    outcome, lateness = _run(checked, recorder)
-    recorder.finish(end_facts(outcome, lateness), outcome.ended_at)
-    cut = f"; the recording is truncated: {recorder.error}" if recorder.error else ""
-    return RunResult(
-        path=output,
-        code="fault" if recorder.error else outcome.code,
+def run_unpaced(run: CheckedRun, output: Path, *, overwrite: bool = False) -> RunResult:
+    """Run a checked run on its simulated devices; raise InputError for a real one."""
+    for info in (each.loaded.device.info for each in run.axes):
+        if not info.simulated:
+            raise InputError(f"{info.name}: only a simulated device can run without real time")
+    recordings = recordings_of(run.names, output)
+    recorders = recorders_of(run, recordings, overwrite=overwrite)
+    outcome, lateness = _run(run, recorders)
+    for recorder in recorders:
+        recorder.finish(end_facts(outcome, lateness), outcome.ended_at)
+    error = next(filter(None, (each.error for each in recorders)), "")
+    cut = f"; the recording is truncated: {error}" if error else ""
+    return RunResult.of(
+        dict(zip(recordings, map(result_of, recorders), strict=True)),
+        code="fault" if error else outcome.code,
         reason=outcome.reason + cut,
         output_state=outcome.output,
         stop_signal=0,
-        samples=recorder.samples,
-        missing=recorder.missing,
         late_ticks=lateness.late_ticks,
-        adapted=recorder.adapted,
     )
 
 
-def _run(checked: CheckedExperiment, recorder: Recorder) -> tuple[LoopOutcome, Lateness]:
-    loaded, begun = checked.loaded, checked.begun
-    plan = assemble(
-        loaded,
-        checked.reference.values,
-        begun.input_um,
-        begun.state,
-        checked.conditioning(),
-        operator=checked.operator,
-        paced=False,
-        heat_a2=checked.heat_a2,
-        segments=checked.reference.segments,
-    )
+def _run(run: CheckedRun, recorders: Sequence[Recorder]) -> tuple[LoopOutcome, Lateness]:
+    axes = [
+        axis_plan(
+            each.loaded,
+            each.reference.values,
+            each.begun.input_um,
+            each.begun.state,
+            each.conditioning(),
+            operator=each.operator,
+            heat_a2=each.heat_a2,
+        )
+        for each in run.axes
+    ]
+    first = run.first
+    plan = assemble(first.loaded, axes, paced=False, segments=first.reference.segments)
 
     def refused() -> str:
-        """Return why the file cannot be written after a retry, or an empty text."""
-        return recorder.error if recorder.error and not recorder.flush() else ""
+        """Return why a file cannot be written after a retry, or an empty text."""
+        errors = (each.error for each in recorders if each.error and not each.flush())
+        return next(errors, "")
 
-    flush_samples = loaded.config.recording.flush_s * plan.sample_rate_hz
+    flush_samples = run.config.recording.flush_s * plan.sample_rate_hz
 
-    def written(batch: BlockBatch) -> None:
+    def written(batch: BlockBatch, recorder: Recorder) -> None:
         """Write a batch; flush as often as a run in real time, so that chunks are alike."""
         recorder.batch(batch)
         if recorder.next_sample % flush_samples < batch.flags.size:
             recorder.flush()
 
-    host = OfflineHost(plan, on_batch=[written], on_event=[recorder.event], stop=refused)
-    devices = [loaded.device]
+    host = OfflineHost(
+        plan,
+        on_batch=[partial(written, recorder=each) for each in recorders],
+        on_event=[each.event for each in recorders],
+        stop=refused,
+    )
+    devices = [each.loaded.device for each in run.axes]
+    at_start = [each.loaded.config.safe.at_start for each in run.axes]
     try:
-        loop, waveform_at = _opened(plan, devices, host, [loaded.config.safe.at_start])
-        recorder.begin(time.time_ns(), {"paced": "false"}, waveform_at)
+        loop, waveform_at = _opened(plan, devices, host, at_start)
+        start_unix_ns = time.time_ns()
+        for recorder in recorders:
+            recorder.begin(start_unix_ns, {"paced": "false"}, waveform_at)
     except HilctlError:
         _closed(devices)
-        recorder.discard()
+        discard_all(recorders)
         raise
     return _drive(loop, devices, host)
 

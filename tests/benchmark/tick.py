@@ -23,7 +23,7 @@ from hilctl.base.private_dirs import memory_folder
 from hilctl.base.samples import BlockHeader
 from hilctl.experiment.devices import BUILTIN
 from hilctl.experiment.load import LoadedExperiment, load_experiment
-from hilctl.experiment.preflight import CheckedExperiment, check
+from hilctl.experiment.preflight import CheckedExperiment, CheckedRun, check
 from hilctl.loop.pacer import SystemClock
 from hilctl.machine.rt_setup import Realtime, prepare
 from hilctl.run import loop_process
@@ -86,7 +86,12 @@ def experiment(
 def job(folder: RunFolder, checked: CheckedExperiment) -> Job:
     """Return what the supervisor hands to the loop process, without a heartbeat timeout."""
     return Job.of(
-        checked, folder, locks=[], take_over=False, supervisor=os.getppid(), silence_s=1e9
+        CheckedRun((checked,)),
+        folder,
+        locks=[],
+        take_over=False,
+        supervisor=os.getppid(),
+        silence_s=1e9,
     )
 
 
@@ -120,7 +125,7 @@ def ticks_us(
         )
         work = job(folder, checked)
         threading.Thread(target=start, args=(ring.page,), daemon=True).start()
-        outcome = loop_process.run_job(work, ring)
+        outcome = loop_process.run_job(work, [ring])
         heads = [batch.heads for batch in ring.batches()]
     if outcome.code != "completed" or not heads:
         sys.exit(f"the run ended as {outcome.code}: {outcome.reason}")

@@ -17,7 +17,7 @@ from hilctl.experiment.recording_settings import RecordingConfig
 from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.run.recorder import Recorder
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 from hilctl.run.unpaced import run_unpaced
 
 EXPERIMENT = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
@@ -32,7 +32,7 @@ RUN = RunFacts({}, (), "name: writing\n", "", LAYOUT)
 
 def batches(seconds: int, folder: Path) -> list[BlockBatch]:
     """Return a run of the simulated rig as the recorder takes it out of the ring."""
-    checked = checked_experiment(EXPERIMENT, [f"waveform.duration_s={seconds}"])
+    checked = checked_run(EXPERIMENT, [f"waveform.duration_s={seconds}"])
     found: list[BlockBatch] = []
 
     def keep(_recorder: Recorder, batch: BlockBatch) -> None:

@@ -16,7 +16,7 @@ from hilctl.recording.reader import read
 from hilctl.run.control.client import status_of
 from hilctl.run.recovery import recover_dead_runs
 from hilctl.run.run_folder import base_folder, runs
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 from hilctl.run.supervisor import Supervisor
 from tests.faults.conftest import StartedRun, simulated, sine
 
@@ -182,7 +182,7 @@ def test_model_exchanged_after_the_check_changes_nothing(tmp_path):
     waveform |= {"duration_s": 0.1, "soft_start_s": 0.05}
     compensator = {"model": model.name}
     path = experiment(tmp_path, waveform=waveform, compensator=compensator)
-    checked = checked_experiment(path, ())
+    checked = checked_run(path, ())
     model.write_text((MODELS / "terfenol_rdpi.yaml").read_text())
     output = tmp_path / "run.mcap"
     result = Supervisor(checked, output, overwrite=False, on_progress=lambda _: None).run()
@@ -192,7 +192,7 @@ def test_model_exchanged_after_the_check_changes_nothing(tmp_path):
 
 def supervised(folder, on_progress=lambda _: None, **changes):
     """Run an experiment in this process; return how it ended, and its recording."""
-    checked = checked_experiment(experiment(folder, **changes), ())
+    checked = checked_run(experiment(folder, **changes), ())
     output = folder / "run.mcap"
     result = Supervisor(checked, output, overwrite=False, on_progress=on_progress).run()
     return result, read(output)
@@ -270,7 +270,7 @@ def test_lost_recording_is_a_fault(tmp_path, how, on_failure):
 
     changes = {"waveform": short(3.0)}
     changes["recording"] = {"flush_s": 0.1, "ring_s": 2.0, "on_failure": on_failure}
-    checked = checked_experiment(experiment(tmp_path, **changes), ())
+    checked = checked_run(experiment(tmp_path, **changes), ())
     result = Supervisor(checked, output, overwrite=False, on_progress=take_away).run()
     assert done
     assert (result.code, result.output_state) == ("fault", "confirmed")

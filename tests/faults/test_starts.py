@@ -13,7 +13,7 @@ from hilctl.recording.reader import read
 from hilctl.run import supervisor as module
 from hilctl.run.recorder import Recorder
 from hilctl.run.run_folder import runs
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 from hilctl.run.supervisor import Supervisor
 from tests.fakes import children_of, held_devices
 from tests.faults.conftest import EXPERIMENT, simulated, sine
@@ -28,7 +28,7 @@ def start(tmp_path):
     def run(experiment):
         path = tmp_path / "experiment.yaml"
         path.write_text(yaml.safe_dump(experiment), encoding="utf-8")
-        checked = checked_experiment(path, ())
+        checked = checked_run(path, ())
         output = tmp_path / "run.mcap"
         return Supervisor(checked, output, overwrite=False, on_progress=lambda _: None).run()
 
@@ -42,7 +42,7 @@ def assert_nothing_is_left(folder, processes):
 
 
 @pytest.mark.parametrize("step", [
-    "Recorder", "ControlServer", "LoopProcess", "GuardianProcess", "Recorder.begin", "favoured",
+    "recorders_of", "ControlServer", "LoopProcess", "GuardianProcess", "Recorder.begin", "favoured",
     "RingRecorder.start",
 ])  # fmt: skip
 def test_failed_start_leaves_nothing(device, start, tmp_path, monkeypatch, step):
@@ -72,7 +72,9 @@ def test_refused_real_time_is_reported(device, start, monkeypatch, caplog, simul
     read_text = module.SharedPage.read_text
 
     def refused(page, slot):
-        return '[{}, ["fifo: x"]]' if slot is module.PageSlot.SET_UP else read_text(page, slot)
+        return (
+            '[{}, [{}], ["fifo: x"]]' if slot is module.PageSlot.SET_UP else read_text(page, slot)
+        )
 
     monkeypatch.setattr(module.SharedPage, "read_text", refused)
     monkeypatch.setattr(module, "favoured", Mock(side_effect=OSError(24, "stopped by the test")))

@@ -12,7 +12,7 @@ import yaml
 from hilctl.experiment.state_files import DeviceState, MachineTime
 from hilctl.recording.run_summary import read_ends
 from hilctl.run.recovery import recover_dead_runs
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 from hilctl.run.supervisor import Supervisor
 from tests.faults.conftest import MODULE, PATIENT_DEVICE, PATIENT_TIMING, T7, each_kind, tcp
 
@@ -201,7 +201,7 @@ def test_profile_exchanged_after_the_check_changes_nothing(emulate, tmp_path, pr
     path = tmp_path / "run.yaml"
     changes = {"sample_rate_hz": 50, "device": section, "waveform": waveform}
     path.write_text(yaml.safe_dump({**EXPERIMENT, **changes}), encoding="utf-8")
-    checked = checked_experiment(path, ())
+    checked = checked_run(path, ())
     mine.write_text(mine.read_text().replace("address: 100", "address: 90"))
     output = tmp_path / "run.mcap"
     result = Supervisor(checked, output, overwrite=False, on_progress=lambda _: None).run()

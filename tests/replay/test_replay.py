@@ -15,6 +15,7 @@ from hilctl.base.errors import DataError
 from hilctl.base.events import OFFSET
 from hilctl.base.samples import Flag
 from hilctl.experiment.device_state import initial_state_after
+from hilctl.experiment.preflight import CheckedRun
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel
 from hilctl.models.linear_stages import FirstMode
@@ -23,7 +24,7 @@ from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.run.result import RunResult
-from hilctl.run.start import checked_experiment, start_run
+from hilctl.run.start import checked_experiment, checked_run, start_run
 from hilctl.run.unpaced import run_unpaced
 from tests.published import terfenol_rdpi
 
@@ -41,7 +42,7 @@ STAGED = StagedModel.around(
 
 def unpaced(path: Path, output: Path) -> RunResult:
     """Run in this process, as fast as it goes."""
-    return run_unpaced(checked_experiment(path, []), output)
+    return run_unpaced(checked_run(path, []), output)
 
 
 def paced(path: Path, output: Path) -> RunResult:
@@ -160,7 +161,7 @@ def test_run_with_a_condition_is_identical(tmp_path, block, output):
         "compensator={model: models/terfenol_staged.yaml, offset: measured}",
     ]
     checked = checked_experiment(SINE, settings)
-    recording = read(run_unpaced(checked, tmp_path / "run.mcap").path)
+    recording = read(run_unpaced(CheckedRun((checked,)), tmp_path / "run.mcap").path)
     result = replay(recording)
     assert (result.identical, result.left_out_samples) == (True, 0)
     samples, conditioning = recording.samples, checked.conditioning()

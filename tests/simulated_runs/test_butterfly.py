@@ -17,7 +17,7 @@ from hilctl.lab.identify.fit_model import fit_model
 from hilctl.lab.identify.settings import FitSettings
 from hilctl.models.model_file import dump_model, load_model
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment, start_run
+from hilctl.run.start import checked_run, start_run
 from hilctl.run.unpaced import run_unpaced
 from hilctl_drivers.simulated.terfenol import TerfenolParameters
 from tests.rig import steady_loop
@@ -73,7 +73,7 @@ def test_butterflies_are_identified_by_the_command(tmp_path):
         f"waveform={json.dumps({'kind': 'sequence', 'unit': 'A', 'parts': sines})}",
         "compensator=none",
     )
-    checked = checked_experiment(CONFIG, settings)
+    checked = checked_run(CONFIG, settings)
     loops, model = tmp_path / "loops.mcap", tmp_path / "model.yaml"
     assert run_unpaced(checked, loops, overwrite=True).code == "completed"
     words = ["identify", str(loops), "--model", "butterfly", "--set", "turning_um=0.0"]

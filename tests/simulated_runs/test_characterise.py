@@ -16,7 +16,7 @@ from hilctl.lab.studies.characterise.characterisation_runner import (
 )
 from hilctl.lab.studies.study import StudyHost
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment, unpaced
+from hilctl.run.start import checked_run, unpaced
 from hilctl.run.unpaced import run_unpaced
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -46,7 +46,7 @@ def test_a_rig_of_any_physics_gets_a_model(tmp_path, other_rigs, physics, within
         *other, f"compensator.model={model}", "waveform.amplitude=30.0", "waveform.offset=-5.0",
         "waveform.frequency_hz=50.0", "waveform.duration_s=0.9", "device.seed=99",
     ]  # fmt: skip
-    run = run_unpaced(checked_experiment(RIG, settings), tmp_path / "run.mcap")
+    run = run_unpaced(checked_run(RIG, settings), tmp_path / "run.mcap")
     assert summarize(read(run.path)).peak_error_percent < within_percent
 
 

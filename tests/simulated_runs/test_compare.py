@@ -10,7 +10,7 @@ from hilctl.analysis.report import summarize
 from hilctl.experiment.load import load_experiment
 from hilctl.lab.comparison.simulated_trials import TrialDevice
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 from hilctl.run.unpaced import run_unpaced
 from tests.commands import hilctl
 
@@ -26,7 +26,7 @@ def folder(tmp_path_factory):
 def models(folder):
     """Every model of the catalogue on the loops of chapter 4, by name, as the command prints it."""
     loops, page = folder / "loops.mcap", folder / "models.html"
-    run = run_unpaced(checked_experiment(CONFIGS / "identify_omega_chapter4.yaml", []), loops)
+    run = run_unpaced(checked_run(CONFIGS / "identify_omega_chapter4.yaml", []), loops)
     assert run.code == "completed"
     ended = hilctl("compare", loops, "--html", page, "--save", folder, "--json")
     return {model["name"]: model for model in json.loads(ended.stdout)["models"]}
@@ -79,7 +79,7 @@ def test_a_saved_model_runs_like_any_other(models, folder, name):
     path = folder / f"{name}.mcap"
     settings = [f"compensator.model={folder / name}.yaml", "waveform.frequency_hz=100",
                 "waveform.duration_s=0.5"]  # fmt: skip
-    run = run_unpaced(checked_experiment(CONFIGS / "terfenol_sine_6a.yaml", settings), path)
+    run = run_unpaced(checked_run(CONFIGS / "terfenol_sine_6a.yaml", settings), path)
     assert run.code == "completed"
     recording = read(path)
     assert replay(recording).identical

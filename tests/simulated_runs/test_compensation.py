@@ -6,7 +6,7 @@ import pytest
 
 from hilctl.analysis.report import summarize
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment, start_run
+from hilctl.run.start import checked_run, start_run
 from hilctl.run.unpaced import run_unpaced
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -57,7 +57,7 @@ def test_published_hysteresis_is_reached_up_to_200_hz(sweep, frequency_hz):
 def test_minor_loops_are_compensated(tmp_path, name, peak_percent):
     """Complex harmonics stay within the published error of 3.1 of 83.1 um."""
     path = tmp_path / "run.mcap"
-    result = run_unpaced(checked_experiment(CONFIGS / f"{name}.yaml", []), path)
+    result = run_unpaced(checked_run(CONFIGS / f"{name}.yaml", []), path)
     assert result.code == "completed"
     report = summarize(read(path))
     assert report.peak_error_percent is not None
@@ -75,7 +75,7 @@ def test_a_reversed_actuator_ends_the_run(tmp_path, frequency_hz):
         f"waveform.frequency_hz={frequency_hz}",
     ]
     path = tmp_path / "run.mcap"
-    result = run_unpaced(checked_experiment(CONFIGS / "terfenol_sine_6a.yaml", settings), path)
+    result = run_unpaced(checked_run(CONFIGS / "terfenol_sine_6a.yaml", settings), path)
     assert (result.code, result.output_state) == ("fault", "confirmed")
     assert [event.code for event in read(path).events if event.code == "tracking_error"]
     assert result.samples < 15_000

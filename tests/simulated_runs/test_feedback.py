@@ -11,7 +11,7 @@ from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.base.samples import Flag
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 from hilctl.run.unpaced import run_unpaced
 
 CONFIG = Path(__file__).parents[2] / "configs" / "terfenol_sine_6a.yaml"
@@ -31,7 +31,7 @@ def run(tmp_path):
 
     def run(*settings):
         path = tmp_path / f"{len(list(tmp_path.iterdir()))}.mcap"
-        return run_unpaced(checked_experiment(CONFIG, [*BASE, *settings]), path), read(path)
+        return run_unpaced(checked_run(CONFIG, [*BASE, *settings]), path), read(path)
 
     return run
 

@@ -8,6 +8,7 @@ import pytest
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import DataError
+from hilctl.experiment.preflight import CheckedRun
 from hilctl.loop.tuning import Tuning
 from hilctl.recording import reader
 from hilctl.recording.reader import RecordingStream, read
@@ -46,7 +47,7 @@ def switched(tmp_path_factory):
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_Switched, "changes", changes)
         patch.setattr(unpaced, "OfflineHost", _Switched)
-        assert unpaced.run_unpaced(checked, output).code == "completed"
+        assert unpaced.run_unpaced(CheckedRun((checked,)), output).code == "completed"
     return read(output), checked
 
 
@@ -110,7 +111,7 @@ def test_feedback_and_adaptation_pause_while_bypassed(learns, tmp_path, monkeypa
     )
     monkeypatch.setattr(_Switched, "changes", (out, back))
     monkeypatch.setattr(unpaced, "OfflineHost", _Switched)
-    unpaced.run_unpaced(checked, tmp_path / "run.mcap")
+    unpaced.run_unpaced(CheckedRun((checked,)), tmp_path / "run.mcap")
     recording = read(tmp_path / "run.mcap")
     samples = recording.samples
     # From the second cycle on: the first begins within a block that still learns.

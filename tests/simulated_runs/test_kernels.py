@@ -26,7 +26,7 @@ import json, sys
 from pathlib import Path
 from hilctl.kernels import jit
 from hilctl.run import unpaced
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 
 folder, runs = Path(sys.argv[1]), json.loads(sys.argv[2])
 drive, compiled, late = unpaced._drive, jit._Kernel._compile, []
@@ -43,7 +43,7 @@ def watch(*args):
 unpaced._drive = watch
 samples = 0
 for number, (path, settings) in enumerate(runs):
-    checked = checked_experiment(Path(path), settings)
+    checked = checked_run(Path(path), settings)
     samples += unpaced.run_unpaced(checked, folder / f"{number}.mcap").samples
 print(json.dumps({"late": late, "samples": samples}))
 """
@@ -66,12 +66,12 @@ from pathlib import Path
 import numpy as np
 from hilctl.recording.reader import read
 from hilctl.run import unpaced
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 
 times = {"duration_s": 0.03, "soft_start_s": 0.01, "soft_end_s": 0.01}
 settings = [f"waveform.{name}={value}" for name, value in times.items()]
 path = Path(sys.argv[2])
-unpaced.run_unpaced(checked_experiment(Path(sys.argv[1]), settings), path)
+unpaced.run_unpaced(checked_run(Path(sys.argv[1]), settings), path)
 columns = read(path).samples.columns()
 np.save(path.with_suffix(".npy"), np.array([each for each in columns.values() if each.size]))
 """

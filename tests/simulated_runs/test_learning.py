@@ -13,13 +13,14 @@ from hilctl.analysis.report import summarize
 from hilctl.cli.commands import app
 from hilctl.experiment.correction import load_correction
 from hilctl.experiment.load import load_experiment
+from hilctl.experiment.preflight import CheckedRun
 from hilctl.lab.studies.learn import IlcSession
 from hilctl.lab.studies.study import REPEATS, StudyHost, run_study
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, load_model
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment, paced, start_run, unpaced
+from hilctl.run.start import checked_experiment, checked_run, paced, start_run, unpaced
 from hilctl.run.unpaced import run_unpaced
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -95,7 +96,7 @@ def test_the_delay_of_a_link_is_found(tmp_path):
     def late(path, settings, output, on_part, **_):
         checked = checked_experiment(path, settings)
         loaded = replace(checked.loaded, device=Late(checked.loaded.device, 40))
-        return run_unpaced(replace(checked, loaded=loaded), output, overwrite=True)
+        return run_unpaced(CheckedRun((replace(checked, loaded=loaded),)), output, overwrite=True)
 
     plain = learn(tmp_path / "plain", at(100.0))
     behind = learn(tmp_path / "late", at(100.0), run=late)
@@ -133,7 +134,7 @@ def test_a_compensator_that_looks_ahead_is_corrected_too(tmp_path, staged):
 def test_a_run_without_real_time_is_the_same_run(tmp_path, staged):
     settings = at(100.0, staged)
     start_run(SINE, settings, tmp_path / "paced.mcap", False, lambda progress: None)
-    run_unpaced(checked_experiment(SINE, settings), tmp_path / "unpaced.mcap")
+    run_unpaced(checked_run(SINE, settings), tmp_path / "unpaced.mcap")
     one, other = (read(tmp_path / f"{name}.mcap") for name in ("paced", "unpaced"))
     assert np.array_equal(one.samples.command, other.samples.command)
     assert np.array_equal(one.samples.displacement_um, other.samples.displacement_um)
@@ -161,7 +162,7 @@ def test_the_command_writes_a_correction_that_a_run_uses(tmp_path):
     said = json.loads(answer.output)
     assert [run["run"] for run in said["runs"]] == list(range(7))
     settings = [*at(100.0), "waveform.duration_s=1.0", "device.seed=99"]
-    checked = checked_experiment(SINE, [*settings, f"compensator.correction={output}"])
+    checked = checked_run(SINE, [*settings, f"compensator.correction={output}"])
     run_unpaced(checked, tmp_path / "use.mcap")
     assert summarize(read(tmp_path / "use.mcap")).peak_error_percent <= 0.15
     again = CliRunner().invoke(app, command)

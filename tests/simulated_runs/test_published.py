@@ -15,7 +15,7 @@ from hilctl.analysis.report import summarize
 from hilctl.models.model_file import dump_model
 from hilctl.models.plays import SpiModel
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 from hilctl.run.unpaced import run_unpaced
 from tests.published import piezo_ppi, terfenol_rdpi
 
@@ -34,7 +34,7 @@ def run(tmp_path):
 
     def run_with(path, *settings):
         output = tmp_path / "run.mcap"
-        result = run_unpaced(checked_experiment(path, settings), output, overwrite=True)
+        result = run_unpaced(checked_run(path, settings), output, overwrite=True)
         assert result.code == "completed"
         return read(output)
 

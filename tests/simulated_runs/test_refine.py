@@ -6,7 +6,7 @@ from hilctl import api
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.recording.reader import read
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_run
 from hilctl.run.unpaced import run_unpaced
 
 CONFIGS = Path(__file__).parents[2] / "configs"
@@ -22,7 +22,7 @@ def run(path, model, frequency_hz, amplitude_um, seed, strain=1.05):
         f"waveform.amplitude={amplitude_um}", f"device.seed={seed}", f"device.vary.strain={strain}",
         f"waveform.duration_s={0.5 + 3.0 / frequency_hz:.4f}",
     ]  # fmt: skip
-    run_unpaced(checked_experiment(SINE, settings), path)
+    run_unpaced(checked_run(SINE, settings), path)
     return path
 
 

@@ -17,7 +17,7 @@ from hilctl.experiment.load import LoadedExperiment
 from hilctl.lab.identify.data.records import SteadyLoop
 from hilctl.loop.interlocks import AuxLimit, InterlockContext, InterlockSettings
 from hilctl.models.base import HysteresisModel
-from hilctl.run.assemble import assemble
+from hilctl.run.assemble import assemble, axis_plan
 from hilctl.run.unpaced import run_in_memory
 from hilctl.signals.segment_metrics import SegmentMetrics
 from hilctl.waveforms.build import Reference, build
@@ -117,9 +117,8 @@ class TrialDevice:
         loaded = replace(self._loaded, model=model)
         begun = begin(model, reference.sample_rate_hz, reference.values)
         values = (reference.values, begun.input_um[:], begun.state)
-        plan = assemble(loaded, *values, paced=False)
         axis = replace(
-            plan.axes[0],
+            axis_plan(loaded, *values),
             # Evaluate inaccurate models, too, instead of stopping them.
             interlocks=InterlockContext(
                 stroke_um=(-math.inf, math.inf),
@@ -128,7 +127,8 @@ class TrialDevice:
             interlock_settings=InterlockSettings(),
             feedback=None,
         )
-        outcome, [samples] = run_in_memory(replace(plan, axes=(axis,)), [loaded.device])
+        plan = assemble(loaded, [axis], paced=False)
+        outcome, [samples] = run_in_memory(plan, [loaded.device])
         if outcome.code == "fault":
             raise DeviceError(outcome.reason)
         return _judged(reference, samples.displacement_um, samples.flags)

@@ -27,7 +27,8 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import MARK, Event
 from hilctl.base.private_dirs import private_folder
 from hilctl.base.strict import HALF_CHARACTER, StrictModel, first_problem, without_halves
-from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.axes import names_text
+from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
 from hilctl.loop.compensator import Compensator
 from hilctl.run.control.client import (
     MAX_BYTES,
@@ -404,16 +405,16 @@ class Requests:
 
     def __init__(
         self,
-        checked: CheckedExperiment,
+        run: CheckedRun,
         folder: RunFolder,
         page: SharedPage,
         recording: RingRecorder,
     ) -> None:
-        self._checked = checked
+        self._run = run
         self._folder = folder
         self._page = page
-        self._recording, self._recorder = recording, recording.recorder
-        self._changes = Changes(checked, page)
+        self._recording = recording
+        self._changes = Changes(run.first, page)
 
     def answer(self, line: bytes) -> Mapping[str, Any]:
         """Answer one line of JSON, from any thread; a change waits for the previous one."""
@@ -428,6 +429,11 @@ class Requests:
             return self._status()
         if isinstance(request, MarkRequest):
             return self._mark(request.text)
+        if len(self._run.axes) > 1:
+            raise InputError(
+                f"set: a run of several axes ({names_text(self._run.names)}) keeps "
+                "its references: gain, offset and inverse are for one axis"
+            )
         return self._changes.make(request)
 
     def _mark(self, text: str) -> dict[str, Any]:
@@ -439,19 +445,19 @@ class Requests:
         return {"sample": sample, "text": text}
 
     def _status(self) -> dict[str, Any]:
-        page, config = self._page, self._checked.loaded.config
+        page, config = self._page, self._run.config
         return {
             **facts_of(self._folder),
             "state": page.state(),
             "sample": page.get(PageField.NEXT_SAMPLE),
-            "total_samples": self._checked.forecast.samples,
+            "total_samples": self._run.first.forecast.samples,
             "sample_rate_hz": config.sample_rate_hz,
-            "recorded_samples": self._recorder.samples,
-            "missing_samples": self._recorder.missing,
+            "recorded_samples": self._recording.recorders[0].samples,
+            "missing_samples": sum(each.missing for each in self._recording.recorders),
             "late_ticks": page.get(PageField.LATE_TICKS),
             "gain": self._changes.gain,
             "offset": self._changes.offset,
             "inverse": self._changes.inverse,
-            "recording_error": self._recorder.error,
+            "recording_error": self._recording.error,
             "heartbeat_age_s": (time.monotonic_ns() - page.get(PageField.LOOP_HEARTBEAT_NS)) * 1e-9,
         }

@@ -259,7 +259,8 @@ class Guardian:
         signal.signal(signal.SIGTERM, self._end)
         while self._awaits_device():
             page.put(PageField.GUARDIAN_PHASE, GuardianPhase.ACTING)
-            goal = safe_goal(self._ring, self._device, self._job.safe_value, self._job.ramp_per_s)
+            axis = self._job.axes[0]
+            goal = safe_goal(self._ring, self._device, axis.safe_value, axis.ramp_per_s)
             action = SafeAction(page, self._device, goal, hung=hung, prepare=self._prepare)
             if self._is_final(action):
                 action.end(0.0)
@@ -338,11 +339,12 @@ def main(words: list[str]) -> int:
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends after the loop
     job = Job.read(Path(words[0]))
-    ring = SampleRing(Path(job.ring))
+    axis = job.axes[0]  # a run of several axes is simulated, and has no guardian
+    ring = SampleRing(Path(axis.ring))
     page = ring.page
     page.put(PageField.GUARDIAN_PID, os.getpid())
     try:
-        device = job.device()
+        device = axis.device()
     except (HilctlError, MemoryError) as error:
         page.write_text(PageSlot.GUARDIAN, str(error) or "not enough memory")
         # After the text, which readers expect in this phase.

@@ -59,7 +59,7 @@ class SafetyMonitor:
         self._limits = limits = checked.loaded.config.command_limits()
         way = max(limits.high - limits.safe, limits.safe - limits.low)
         self._patience_ns = round(1e9 * (PATIENCE_S + way / limits.ramp_per_s))
-        self._priority = safe_priority(checked)
+        self._priority = safe_priority(checked.loaded.config)
         self._watch = HangWatch(ring.page, checked.silence, lambda: is_stopped(child.pid))
         RESERVE.hold()
         self._start_guardian, self._record_event = start_guardian, record_event

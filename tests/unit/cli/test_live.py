@@ -295,7 +295,7 @@ def test_server_is_started_and_its_address_printed(served, hilctl, words, port, 
 
 def test_server_of_a_run_ends_with_it(served, hilctl, tmp_path):
     nothing = SimpleNamespace(feed=lambda name: None)
-    with run_folder("demo", tmp_path / "a.mcap", 1.0) as (folder, _):
+    with run_folder("demo", {"": tmp_path / "a.mcap"}, 1.0) as (folder, _):
         assert hilctl("live", "x")[0] == 2
         assert hilctl("live", "de")[0] == 0
         assert served["chosen"]([]) == folder

@@ -93,7 +93,7 @@ def axes(tmp_path_factory):
     """Two axes of a run on a circle, and a run of another, in one folder."""
     folder = tmp_path_factory.mktemp("axes")
     sine = {"kind": "sine", "unit": "um", "amplitude": 20.0, "frequency_hz": 50.0}
-    sine |= {"offset": -6.9, "duration_s": 0.26, "soft_start_s": 0.2}
+    sine |= {"offset": -6.9, "duration_s": 0.26, "soft_start_s": 0.2, "soft_end_s": 0.0}
     phases = {"x": 90.0, "y": 0.0}
     settings = {name: {"waveform": sine | {"phase_deg": each}} for name, each in phases.items()}
     run_of_axes(CONFIGS / "demo.yaml", folder, {"x": settings["x"], "z": settings["y"]}, "other")

@@ -36,7 +36,7 @@ def started(monkeypatch):
         return replace(ENDED, **ends)
 
     monkeypatch.setattr("hilctl.api.runs.start_run", start_run)
-    monkeypatch.setattr(module, "report_of", lambda result, *, every: None)
+    monkeypatch.setattr(module, "reports_of", lambda result, *, every: [])
     return asked, ends
 
 
@@ -56,7 +56,7 @@ def test_interrupted_report_keeps_the_result(started, hilctl, monkeypatch):
     def interrupted(result, *, every):
         raise KeyboardInterrupt
 
-    monkeypatch.setattr(module, "report_of", interrupted)
+    monkeypatch.setattr(module, "reports_of", interrupted)
     before = signal.getsignal(signal.SIGINT)
     try:
         code, out, _ = hilctl("run", DEMO, "--json")
@@ -112,7 +112,7 @@ def test_address_of_the_page_is_printed_with_the_first_samples(capsys):
 @pytest.mark.parametrize("safe", [True, False])
 def test_unsafe_output_is_printed(capsys, safe):
     state = "confirmed" if safe else "unknown"
-    print_run(replace(ENDED, code="fault", reason="lost", output_state=state), None)
+    print_run(replace(ENDED, code="fault", reason="lost", output_state=state), [])
     shown = capsys.readouterr().out
     assert "fault: lost" in shown
     assert "no samples" in shown
@@ -121,15 +121,15 @@ def test_unsafe_output_is_printed(capsys, safe):
 
 def test_quiet_prints_a_fault(monkeypatch, capsys):
     monkeypatch.setattr(Verbosity, "quiet", True)
-    print_run(ENDED, None)
+    print_run(ENDED, [])
     assert capsys.readouterr().err == ""
-    print_run(replace(ENDED, code="fault", reason="lost"), None)
+    print_run(replace(ENDED, code="fault", reason="lost"), [])
     assert "lost" in capsys.readouterr().err
 
 
 def test_adaptation_is_printed_without_a_report(capsys):
     adapted = {"offset_um": 1.25, "gain": 1.02, "weight_1": -0.005}
-    print_run(replace(ENDED, samples=9, adapted=adapted), None)
+    print_run(replace(ENDED, samples=9, adapted=adapted), [])
     assert "offset +1.25 µm, gain 1.0200" in capsys.readouterr().out
 
 

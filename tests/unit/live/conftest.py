@@ -26,7 +26,7 @@ def description():
 @contextmanager
 def active_run(description, place, slots=16):
     """Yield the folder and the ring of a run at 50 kHz."""
-    with run_folder("demo", place / "a.mcap", 12.0) as (folder, _):
+    with run_folder("demo", {"": place / "a.mcap"}, 12.0) as (folder, _):
         yield folder, begun(folder, description, slots)
 
 

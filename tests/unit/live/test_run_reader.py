@@ -112,7 +112,10 @@ def test_end_of_a_run_keeps_its_data(description, tmp_path):
 
 
 def test_unreadable_run_is_an_error(tmp_path):
-    with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _), pytest.raises(RunError):
+    with (
+        run_folder("demo", {"": tmp_path / "a.mcap"}, 12.0) as (folder, _),
+        pytest.raises(RunError),
+    ):
         RunReader(folder)
 
 
@@ -143,7 +146,7 @@ def test_run_is_listed_until_it_has_ended_and_is_not_shown(description, tmp_path
     feeds = RunList(first)
     feeds.update(0.0)
     assert feeds.feed(None) is None
-    with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
+    with run_folder("demo", {"": tmp_path / "a.mcap"}, 12.0) as (folder, _):
         begun(folder, description)
         feeds.update(0.5)
         assert feeds.feed(None) is None  # runs are looked for once a second
@@ -155,7 +158,7 @@ def test_run_is_listed_until_it_has_ended_and_is_not_shown(description, tmp_path
     assert feed.ended
     feeds.update(2.0, [None])
     assert list(feeds) == [feed]  # the main run stays until there is another
-    with run_folder("other", tmp_path / "b.mcap", 12.0) as (folder, _):
+    with run_folder("other", {"": tmp_path / "b.mcap"}, 12.0) as (folder, _):
         begun(folder, description)
         feeds.update(3.0)
         assert feeds.feed(None) is feeds.feed(folder.card.name)
@@ -165,7 +168,7 @@ def test_run_is_listed_until_it_has_ended_and_is_not_shown(description, tmp_path
 
 def test_starting_run_is_read_again(description, tmp_path):
     feeds = RunList(first)
-    with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
+    with run_folder("demo", {"": tmp_path / "a.mcap"}, 12.0) as (folder, _):
         feeds.update(0.0)
         assert feeds.feed(None) is None
         begun(folder, description)

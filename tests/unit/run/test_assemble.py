@@ -7,7 +7,7 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilctl.run.assemble import assemble
+from hilctl.run.assemble import assemble, axis_plan
 from hilctl.run.start import checked_experiment
 
 CONFIGS = Path(__file__).parents[3] / "configs"
@@ -15,7 +15,7 @@ CONFIGS = Path(__file__).parents[3] / "configs"
 
 def planned(loaded, state=None, *, paced=True):
     values = np.zeros(100)
-    return assemble(loaded, values, values, state, paced=paced)
+    return assemble(loaded, [axis_plan(loaded, values, values, state)], paced=paced)
 
 
 def loaded_of(*settings, name="demo.yaml", **info):

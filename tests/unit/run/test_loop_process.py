@@ -12,6 +12,7 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import DeviceError, InputError, RunError
+from hilctl.experiment.preflight import CheckedRun
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.interlocks import InterlockContext
 from hilctl.loop.limiter import CommandLimits
@@ -69,7 +70,12 @@ class Prepared:
         self.page.put(PageField.HAS_DEVICE, 1)
         self.page.put(PageField.GO, 1)
         self.job = Job.of(
-            checked, folder, locks=[], take_over=False, supervisor=os.getppid(), silence_s=1.0
+            CheckedRun((checked,)),
+            folder,
+            locks=[],
+            take_over=False,
+            supervisor=os.getppid(),
+            silence_s=1.0,
         )
         self.device = Closing(checked.loaded.device.info, **device_is)
         self.loaded = replace(checked.loaded, device=self.device)
@@ -87,7 +93,7 @@ class Prepared:
         self._patch.setattr("hilctl.loop.loop.Loop.run", run)
 
     def run(self):
-        return loop_process.run_job(self.job, self.ring)
+        return loop_process.run_job(self.job, [self.ring])
 
 
 @pytest.fixture

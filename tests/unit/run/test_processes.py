@@ -105,7 +105,7 @@ def left(tmp_path):
     held = []
 
     def leave(*, guarded=True, recorded=True, holds=(HOLDS,)):
-        with run_folder("sine", tmp_path / "a.mcap", 1.0, holds) as (folder, own):
+        with run_folder("sine", {"": tmp_path / "a.mcap"}, 1.0, holds) as (folder, own):
             page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
             page.put(PageField.GO, 1)
             page.put(PageField.RECORDED, recorded)

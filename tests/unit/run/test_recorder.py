@@ -318,7 +318,7 @@ def ring(tmp_path):
 @pytest.fixture
 def recording(ring):
     """A recording of a ring that is not started: the test calls each step."""
-    return RingRecorder(ring, RecorderDouble(), flush_s=0.0)
+    return RingRecorder([ring], [RecorderDouble()], flush_s=0.0)
 
 
 def exchange(ring, count, *, answered=True):
@@ -331,40 +331,42 @@ def exchange(ring, count, *, answered=True):
 
 
 def test_a_loop_lost_in_its_first_exchange_leaves_its_later_start(ring, recording):
-    recording._start_ns = 100
+    recording._axes[0].begin(100)
     ring.page.put(PageField.START_NS, 130)
     exchange(ring, 1, answered=False)
     recording.end(ENDED, lost_loop=True)
     recording._finish()
-    assert recording.recorder.postponed == [(30, 0)]
-    assert recording.recorder.firsts == [0]
+    assert recording.recorders[0].postponed == [(30, 0)]
+    assert recording.recorders[0].firsts == [0]
 
 
 def test_fast_loop_does_not_delay_flushes(ring, recording):
     exchange(ring, 1)
     flushed = []
-    batch, flush = recording.recorder.batch, recording.recorder.flush
+    batch, flush = recording.recorders[0].batch, recording.recorders[0].flush
 
     def slow(taken):
         batch(taken)
         exchange(ring, len(taken.heads))
 
-    recording.recorder.batch = slow
-    recording.recorder.flush = lambda: flushed.append(recording.recorder.next_sample) or flush()
+    recording.recorders[0].batch = slow
+    recording.recorders[0].flush = lambda: (
+        flushed.append(recording.recorders[0].next_sample) or flush()
+    )
     for _ in range(4):
         recording._work()
     assert flushed == sorted(set(flushed))
     assert len(flushed) == 4
-    recording.recorder.batch = batch
+    recording.recorders[0].batch = batch
     recording.end(ENDED, lost_loop=False)
     recording._finish()
-    numbers = recording.recorder.firsts
+    numbers = recording.recorders[0].firsts
     assert numbers == list(range(len(numbers)))
     assert ring.pop() is None
 
 
 def test_an_event_of_the_loop_never_comes_before_its_samples(ring, recording, monkeypatch):
-    batches, recorder, went_on = ring.batches, recording.recorder, []
+    batches, recorder, went_on = ring.batches, recording.recorders[0], []
 
     def batches_and_go_on():
         yield from batches()
@@ -386,34 +388,34 @@ def test_sent_blocks_of_a_dead_loop_are_recorded_as_unanswered(ring, recording):
     ring._area.heads[1, BlockHeader.SEQUENCE] = 77
     recording.end(LoopOutcome("fault", "it died", 0, "confirmed", 0), lost_loop=True)
     recording._finish()
-    assert recording.recorder.firsts == [0, 2, 3, 4, 5]
-    assert recording.recorder.finished == ("it died", 6)
+    assert recording.recorders[0].firsts == [0, 2, 3, 4, 5]
+    assert recording.recorders[0].finished == ("it died", 6)
 
 
 def test_error_of_the_recorder_thread_is_reported_and_the_recording_ended(ring, recording):
     exchange(ring, 2)
-    recording.recorder.broken = True
-    recording._guarded(recording._work)
-    assert recording.recorder.errors == ["ZeroDivisionError: a bug"]
-    recording.recorder.broken = False
+    recording.recorders[0].broken = True
+    recording._work()
+    assert recording.recorders[0].errors == ["ZeroDivisionError: a bug"]
+    recording.recorders[0].broken = False
     recording.end(ENDED, lost_loop=False)
     recording.start(0)
     recording._thread.join(30.0)
     assert recording.finished
-    assert recording.recorder.finished == ("waveform completed", 8)
+    assert recording.recorders[0].finished == ("waveform completed", 8)
 
 
 def test_marks_are_accepted_while_they_can_be_recorded(ring, recording):
     exchange(ring, 1)
-    recording.recorder.error = ""
+    recording.recorders[0].error = ""
     assert recording.takes_marks
     for _ in range(64):
         recording.record_event(Event(0, "info", "mark", "tapped"))
     assert not recording.takes_marks
     recording._drain()
     assert recording.takes_marks
-    recording.recorder.error = "no room"
+    recording.recorders[0].error = "no room"
     assert not recording.takes_marks
-    recording.recorder.error = ""
+    recording.recorders[0].error = ""
     recording.end(ENDED, lost_loop=False)
     assert not recording.takes_marks

@@ -35,7 +35,7 @@ def dead(tmp_path):
     def leave(fill=lambda folder: None, *, holds=(), guardian=None):
         recording = tmp_path / "a.mcap"
         recording.write_bytes(GOLDEN.read_bytes()[:-100])
-        with run_folder("sine", recording, 12.0, holds) as (folder, (lock,)):
+        with run_folder("sine", {"": recording}, 12.0, holds) as (folder, (lock,)):
             fill(folder)
             folder.keep(recorded=False)
             if guardian is not None:
@@ -173,7 +173,7 @@ def test_dead_run_is_removed_when_its_output_is_safe(orphan, settle):
 
 
 def test_a_living_run_is_left_alone(tmp_path):
-    with run_folder("sine", tmp_path / "a.mcap", 12.0) as (folder, _):
+    with run_folder("sine", {"": tmp_path / "a.mcap"}, 12.0) as (folder, _):
         assert recover_dead_runs() == []
         assert folder.path.is_dir()
 
@@ -227,7 +227,7 @@ def test_folder_that_cannot_be_recovered_can_be_dismissed(dead, tmp_path):
     for name in ("..", ".", "devices"):
         with pytest.raises(InputError, match="named"):
             dismiss(name)
-    with run_folder("sine", tmp_path / "a.mcap", 12.0) as (folder, _):
+    with run_folder("sine", {"": tmp_path / "a.mcap"}, 12.0) as (folder, _):
         with pytest.raises(InputError, match="is active"):
             dismiss(folder.card.name)
         assert runs() == [folder]

@@ -34,7 +34,7 @@ def folders(tmp_path, monkeypatch):
 
 
 def made(tmp_path, name="sine"):
-    return run_folder(name, tmp_path / "a.mcap", 12.0)
+    return run_folder(name, {"": tmp_path / "a.mcap"}, 12.0)
 
 
 def test_run_is_listed_while_it_is_active(tmp_path):
@@ -334,7 +334,7 @@ def test_a_guardian_that_holds_a_device_is_named_with_the_command_that_ends_it(
 ):
     """Also if its run is in another folder of HILCTL_RUNS."""
     name = f"{NAME}guarded"
-    with run_folder("sine", tmp_path / "a.mcap", 12.0, (name,)) as (folder, _):
+    with run_folder("sine", {"": tmp_path / "a.mcap"}, 12.0, (name,)) as (folder, _):
         folder.keep(recorded=True)
     program = "import sys; print(flush=True); input()"
     words = [sys.executable, "-c", program, GUARDIAN, str(folder.job), "act"]

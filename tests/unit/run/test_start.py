@@ -15,6 +15,7 @@ from hilctl.run import start
 from hilctl.run.start import (
     RunKey,
     checked_experiment,
+    checked_run,
     completed_key,
     default_output,
     output_of,
@@ -39,7 +40,7 @@ def test_used_name_gets_a_number(tmp_path):
 
 def test_recording_folder_is_created(tmp_path):
     folder = tmp_path / "new" / "runs"
-    checked = checked_experiment(DEMO, [f"recording.folder={folder}"])
+    checked = checked_run(DEMO, [f"recording.folder={folder}"])
     assert output_of(checked, tmp_path / "mine.mcap") == tmp_path / "mine.mcap"
     assert not folder.exists()
     assert output_of(checked, None).parent == folder
@@ -48,7 +49,7 @@ def test_recording_folder_is_created(tmp_path):
 
 def test_recording_folder_that_cannot_be_created_is_reported(tmp_path):
     (tmp_path / "file").touch()
-    checked = checked_experiment(DEMO, [f"recording.folder={tmp_path / 'file' / 'runs'}"])
+    checked = checked_run(DEMO, [f"recording.folder={tmp_path / 'file' / 'runs'}"])
     with pytest.raises(InputError, match="Not a directory"):
         output_of(checked, None)
 

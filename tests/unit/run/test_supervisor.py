@@ -28,7 +28,8 @@ class Run:
         recorder = SimpleNamespace(samples=5, error="")
         self.stalled = 0.0
         self.recording = SimpleNamespace(
-            recorder=recorder,
+            recorders=[recorder],
+            error="",
             newest=None,
             finished=False,
             stalled_s=lambda: self.stalled,
@@ -50,7 +51,7 @@ class Run:
             config=self.config, device=SimpleNamespace(info=SimpleNamespace(simulated=simulated))
         )
         checked = SimpleNamespace(loaded=loaded, forecast=SimpleNamespace(samples=100))
-        self.started = RunMonitor(checked, ring, self.child, self.safety, self.recording)
+        self.started = RunMonitor(checked, ring.page, self.child, self.safety, self.recording)
 
 
 @pytest.fixture
@@ -71,7 +72,7 @@ def test_recording_stops_the_run_when_the_ring_is_half_full(
     run.started.poll(0)
     assert run.page.get(PageField.STOP) == 0
     run.config.recording.on_failure = on_failure
-    run.recording.recorder.error, run.stalled = error, stalled_s
+    run.recording.error, run.stalled = error, stalled_s
     run.started.poll(0)
     assert run.page.get(PageField.STOP) == stop
 

@@ -15,12 +15,13 @@ from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import InputError
 from hilctl.base.samples import BlockHeader, Flag
+from hilctl.experiment.preflight import CheckedRun
 from hilctl.recording import writer
 from hilctl.recording.metadata_keys import END_FIGURES
 from hilctl.recording.reader import read
 from hilctl.recording.writer import PendingFile
-from hilctl.run.assemble import assemble
-from hilctl.run.start import checked_experiment
+from hilctl.run.assemble import assemble, axis_plan
+from hilctl.run.start import checked_experiment, checked_run
 from hilctl.run.unpaced import OfflineLane, run_in_memory, run_unpaced
 from tests.fakes import FailingFile
 
@@ -47,7 +48,7 @@ def test_a_refused_write_costs_nothing(tmp_path, monkeypatch, pending_bytes, wri
 
     monkeypatch.setattr(writer, "PendingFile", Refused)
     monkeypatch.setattr(writer, "_MOST_PENDING_BYTES", pending_bytes)
-    checked = checked_experiment(UNCOMPENSATED, SHORT)
+    checked = checked_run(UNCOMPENSATED, SHORT)
     result = run_unpaced(checked, tmp_path / "run.mcap")
     assert not disks[0].write_errors
     assert (result.code, result.missing) == ("completed", 0)
@@ -62,7 +63,7 @@ def test_a_refused_write_costs_nothing(tmp_path, monkeypatch, pending_bytes, wri
 )
 def test_an_auxiliary_channel_ends_a_run(tmp_path, settings, value):
     settings += ["device.temperatures={coil_tau_s: 0.2}", "limits.aux={coil_c: 30}"]
-    result = run_unpaced(checked_experiment(UNCOMPENSATED, SHORT + settings), tmp_path / "r.mcap")
+    result = run_unpaced(checked_run(UNCOMPENSATED, SHORT + settings), tmp_path / "r.mcap")
     recording = read(result.path)
     (fault,) = (each for each in recording.events if each.code == "aux")
     at = int(np.searchsorted(recording.samples.index, fault.sample))
@@ -76,7 +77,7 @@ def test_an_auxiliary_channel_ends_a_run(tmp_path, settings, value):
 
 def test_all_exported_files_have_the_auxiliary_channels_of_all_runs(tmp_path):
     for name, settings in (("plain", []), ("warm", ["device.temperatures={coil_tau_s: 0.2}"])):
-        run_unpaced(checked_experiment(UNCOMPENSATED, SHORT + settings), tmp_path / f"{name}.mcap")
+        run_unpaced(checked_run(UNCOMPENSATED, SHORT + settings), tmp_path / f"{name}.mcap")
     assert export_all(tmp_path, tmp_path / "out", lambda part, path: None).written == 2
     for name, channels in (("plain", set()), ("warm", {"coil_c", "rod_c"})):
         (path,) = (tmp_path / "out").rglob(f"{name}-*.parquet")
@@ -111,15 +112,15 @@ def test_every_block_comes_once_and_in_order(latency):
 
 @pytest.mark.parametrize("output", [7.0, -9.5])
 def test_run_from_another_output_ramps_in_and_replays(tmp_path, output):
-    plain = read(run_unpaced(checked_experiment(UNCOMPENSATED, SHORT), tmp_path / "a.mcap").path)
-    checked = checked_experiment(UNCOMPENSATED, [*SHORT, f"device.output_at_open={output}"])
+    plain = read(run_unpaced(checked_run(UNCOMPENSATED, SHORT), tmp_path / "a.mcap").path)
+    checked = checked_run(UNCOMPENSATED, [*SHORT, f"device.output_at_open={output}"])
     result = run_unpaced(checked, tmp_path / "b.mcap")
     recording = read(result.path)
     assert (result.code, result.missing, recording.dropped) == ("completed", 0, 0)
     (segment,) = recording.segments
     n = segment.start
     assert n > 0
-    samples, limits = recording.samples, checked.loaded.config.command_limits()
+    samples, limits = recording.samples, checked.config.command_limits()
     steps = np.abs(np.diff([output, *samples.command]))
     assert steps.max() <= limits.slew_per_s / recording.sample_rate_hz * (1 + 1e-9)
     assert samples.command[n:].tolist() == plain.samples.command.tolist()
@@ -138,7 +139,7 @@ def test_run_from_another_output_ramps_in_and_replays(tmp_path, output):
     (["device.output_at_open=30.0"], "output is 30 A"),
 ])  # fmt: skip
 def test_unknown_or_impossible_start_is_refused(tmp_path, settings, words):
-    checked = checked_experiment(UNCOMPENSATED, [*SHORT, *settings])
+    checked = checked_run(UNCOMPENSATED, [*SHORT, *settings])
     with pytest.raises(InputError, match=words):
         run_unpaced(checked, tmp_path / "run.mcap")
     assert list(tmp_path.iterdir()) == []
@@ -146,9 +147,7 @@ def test_unknown_or_impossible_start_is_refused(tmp_path, settings, words):
 
 def test_start_of_a_device_without_readback_is_set_by_the_user(tmp_path):
     settings = ["device.output_at_open=null", "safe.at_start=0.0"]
-    result = run_unpaced(
-        checked_experiment(UNCOMPENSATED, [*SHORT, *settings]), tmp_path / "r.mcap"
-    )
+    result = run_unpaced(checked_run(UNCOMPENSATED, [*SHORT, *settings]), tmp_path / "r.mcap")
     assert result.code == "completed"
 
 
@@ -157,15 +156,16 @@ def test_real_devices_are_refused_before_a_file_is_created(tmp_path):
     info = replace(checked.loaded.device.info, simulated=False)
     loaded = replace(checked.loaded, device=SimpleNamespace(info=info))
     with pytest.raises(InputError, match="simulated"):
-        run_unpaced(replace(checked, loaded=loaded), tmp_path / "run.mcap")
+        run_unpaced(CheckedRun((replace(checked, loaded=loaded),)), tmp_path / "run.mcap")
     assert list(tmp_path.iterdir()) == []
 
 
 def test_run_in_memory_equals_the_recorded_run(tmp_path):
     checked = checked_experiment(UNCOMPENSATED, SHORT)
-    recorded = read(run_unpaced(checked, tmp_path / "run.mcap").path).samples
+    recorded = read(run_unpaced(CheckedRun((checked,)), tmp_path / "run.mcap").path).samples
     loaded, begun = checked.loaded, checked.begun
-    made = assemble(loaded, checked.reference.values, begun.input_um, begun.state, paced=False)
+    axis = axis_plan(loaded, checked.reference.values, begun.input_um, begun.state)
+    made = assemble(loaded, [axis], paced=False)
     outcome, [samples] = run_in_memory(made, [loaded.device])
     assert outcome.code == "completed"
     assert samples.index.tolist() == recorded.index.tolist()
@@ -178,7 +178,7 @@ def test_run_in_memory_equals_the_recorded_run(tmp_path):
 def test_end_of_a_recording_has_the_metrics_of_the_report(tmp_path, name):
     """They can be read without the samples."""
     soft = [f"waveform.soft_{end}_s=0.05" for end in ("start", "end")]
-    checked = checked_experiment(UNCOMPENSATED.with_stem(name), [*SHORT, *soft])
+    checked = checked_run(UNCOMPENSATED.with_stem(name), [*SHORT, *soft])
     recording = read(run_unpaced(checked, tmp_path / "run.mcap").path)
     report = summarize(recording).to_mapping()
     found = {key: float(recording.end[key]) for key in END_FIGURES if key in recording.end}
@@ -199,7 +199,7 @@ CURRENT = "waveform={kind: %s, unit: A, amplitude: 3.0, duration_s: 1.0, %s}"
     ("terfenol_sine_6a_uncompensated", [CURRENT % ("random", "first_hz: 1, last_hz: 99")]),
 ])  # fmt: skip
 def test_size_of_the_recording_is_forecast(tmp_path, name, settings):
-    checked = checked_experiment(UNCOMPENSATED.with_name(f"{name}.yaml"), settings)
+    checked = checked_run(UNCOMPENSATED.with_name(f"{name}.yaml"), settings)
     result = run_unpaced(checked, tmp_path / "run.mcap")
-    expected = checked.forecast.recording_mb * 1e6
+    expected = checked.first.forecast.recording_mb * 1e6
     assert expected == pytest.approx(result.path.stat().st_size, rel=0.3)

@@ -18,7 +18,7 @@ from hilctl.base.files import TextFiles, write_file
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import resolve
-from hilctl.experiment.preflight import check
+from hilctl.experiment.preflight import CheckedRun, check
 from hilctl.experiment.state_files import MachineTime
 from hilctl.lab.identify.parallel import workers
 from hilctl.lab.studies.campaign.plan import CampaignPlan, PlannedStep, planned
@@ -241,7 +241,8 @@ def run_task(task: FastTask) -> tuple[bytes, RunResult | HilctlError, CampaignRo
     with tempfile.TemporaryDirectory(prefix="hilctl-campaign-") as folder:
         output = Path(folder) / "run.mcap"
         try:
-            result = run_unpaced(check(loaded, task.heat_a2), output)
+            checked = check(loaded, task.heat_a2)
+            result = run_unpaced(CheckedRun((checked,)), output)
         except HilctlError as error:
             return b"", error, None
         row = measured(output) if result.code == COMPLETED else None

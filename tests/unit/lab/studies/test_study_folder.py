@@ -6,7 +6,7 @@ import pytest
 
 from hilctl.base.errors import InputError
 from hilctl.experiment.load import load_experiment
-from hilctl.experiment.preflight import check
+from hilctl.experiment.preflight import CheckedRun, check
 from hilctl.lab.studies import study_folder as folders
 from hilctl.run.start import RunKey
 from hilctl.run.unpaced import run_unpaced
@@ -25,7 +25,7 @@ def recorded(experiment, tmp_path):
     loaded = load_experiment(experiment)
 
     def make(name):
-        run_unpaced(check(loaded), tmp_path / name)
+        run_unpaced(CheckedRun((check(loaded),)), tmp_path / name)
         return tmp_path / name, RunKey.of(loaded)
 
     return make

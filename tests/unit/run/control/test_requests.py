@@ -18,7 +18,7 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import MARK
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import resolve
-from hilctl.experiment.preflight import check
+from hilctl.experiment.preflight import CheckedRun, check
 from hilctl.loop.tuning import LinearBypass
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.run.control import client
@@ -58,15 +58,16 @@ def page():
 @pytest.fixture
 def recording():
     made = SimpleNamespace(events=[], takes_marks=True)
-    made.recorder = SimpleNamespace(samples=450, missing=0, error="")
+    made.recorders = [SimpleNamespace(samples=450, missing=0)]
+    made.error = ""
     made.record_event = made.events.append
     return made
 
 
 @pytest.fixture
 def requests(demo, page, recording, tmp_path):
-    with run_folder("demo", tmp_path / "a.mcap", 12.0) as (folder, _):
-        yield Requests(demo, folder, page, recording)
+    with run_folder("demo", {"": tmp_path / "a.mcap"}, 12.0) as (folder, _):
+        yield Requests(CheckedRun((demo,)), folder, page, recording)
 
 
 def asked(requests, **message):

@@ -19,7 +19,7 @@ from hilctl.base.errors import DeviceError
 from hilctl.experiment.timing import SilenceLimits
 from hilctl.loop.safe_output import LoopOutcome, SafeGoal
 from hilctl.run import run_folder
-from hilctl.run.job import Job
+from hilctl.run.job import AxisJob, Job
 from hilctl.run.run_folder import DeviceLocks
 from hilctl.run.safety import guardian
 from hilctl.run.safety.guardian import (
@@ -50,11 +50,13 @@ JOB_LIMITS = SilenceLimits(1.0, 1.0, 1.0, 1.0)
 
 
 def job_of(experiment, *, ring="", limits=JOB_LIMITS, locks=(), take_over=False):
+    axis = AxisJob(
+        axis="", experiment=experiment, files={}, folder="", ring=ring, reference="", input_um="",
+        state=None, heat_a2=0.0, stands_um=None, adapted=None, safe_value=0.25, ramp_per_s=50.0,
+    )  # fmt: skip
     return Job(
-        experiment=experiment, files={}, folder="", ring=ring, holds=[HOLDS] if locks else [],
-        locks=[*locks], take_over=take_over, reference="", input_um="", state=None, heat_a2=0.0,
-        stands_um=None, segments=[], adapted=None, safe_value=0.25,
-        ramp_per_s=50.0, limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
+        axes=[axis], holds=[HOLDS] if locks else [], locks=[*locks], take_over=take_over,
+        segments=[], limits=limits, supervisor=2, silence_s=1.0, safe_priority=7,
     )  # fmt: skip
 
 
@@ -415,14 +417,14 @@ def test_device_that_cannot_be_created_is_reported_before_the_start(
     written, monkeypatch, experiment, said
 ):
     if "memory" in said:
-        monkeypatch.setattr(Job, "device", Mock(side_effect=MemoryError))
+        monkeypatch.setattr(AxisJob, "device", Mock(side_effect=MemoryError))
     assert written.call(experiment) == 1
     assert written.page.get(PageField.GUARDIAN_PHASE) == GuardianPhase.FAILED
     assert said in written.page.read_text(PageSlot.GUARDIAN)
 
 
 def test_the_device_is_made_of_the_experiment_alone():
-    assert job_of("device: {kind: simulated_terfenol}").device().info.simulated
+    assert job_of("device: {kind: simulated_terfenol}").axes[0].device().info.simulated
 
 
 @pytest.mark.parametrize("limit", [None, 65536])
@@ -436,7 +438,7 @@ def test_guardian_prepares_its_process_for_real_time(written, guarded, monkeypat
         set_fifo=lambda priority: done.append((priority, threading.current_thread().name)),
     )
     monkeypatch.setattr(guardian, "LinuxProcess", lambda: process)
-    monkeypatch.setattr(Job, "device", lambda job: guarded.device)
+    monkeypatch.setattr(AxisJob, "device", lambda job: guarded.device)
     written.page.put(PageField.GO, 1)
     written.page.put_float(PageField.OUTPUT_AT_START, 0.25)
     written.page.put(PageField.PHASE, Phase.RUNNING)
