@@ -1,7 +1,7 @@
 """The experiment file, everything it refers to, and its check before a run. Moves nothing."""
 
 PUBLIC = (
-    "adaptation", "coil_heat", "compensator", "conditioning", "correction", "device_state",
+    "adaptation", "axes", "coil_heat", "compensator", "conditioning", "correction", "device_state",
     "devices", "examples", "feedback", "file", "forecast", "labels", "load", "model_validity",
     "open_loop", "preflight", "recording_settings", "rig", "safe", "state_files", "template",
     "timing",

@@ -31,8 +31,6 @@ FITS: dict[str, dict[str, Any]] = {
     "rdpi, exponential": {"kind": "rdpi", "weights": "exponential", "weight_by": "equal"},
     "integrated, free": {"kind": "integrated", "weights": "free"},
     "integrated, hysteresis": {"kind": "integrated", "weight_by": "hysteresis"},
-    "staged, preisach": {"kind": "staged", "hysteresis": "preisach"},
-    "staged, no lag": {"kind": "staged", "lag": "none"},
 }
 KERNELS = {"Nehalem": "", "Haswell": "avx2", "SkylakeX": "avx512f"}
 """Kernels of OpenBLAS, and the flag of processors that run them."""
