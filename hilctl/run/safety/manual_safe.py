@@ -12,6 +12,7 @@ from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import load_document
+from hilctl.experiment.axes import one_axis_document, with_settings
 from hilctl.experiment.devices import made_device
 from hilctl.experiment.safe import Safe
 from hilctl.loop.safe_output import (
@@ -65,9 +66,7 @@ def put_safe(
     Raises:
         InputError: The file is not valid, or a run holds the device; nothing was sent.
     """
-    document = load_document(path)
-    for setting in settings:
-        document.set(setting)
+    document = one_axis_document(with_settings(load_document(path), settings))
     given = "safe" in document.data
     safe = document.validate(Safe, at=("safe",)) if given else Safe()
     device = made_device(document, path.parent, TextFiles())
