@@ -108,6 +108,12 @@ def broken_rules(
     return problems + [_problem(group, where, at) for group in groups.values()]
 
 
+def _line(problem: ConfigProblem) -> int:
+    """Return the line of a problem; 0 if it has none."""
+    found = re.search(r":(\d+)", problem.where)
+    return int(found[1]) if found else 0
+
+
 def _problem(group: list[_Broken], where: Callable[[Loc], str], at: Loc) -> ConfigProblem:
     first = group[0]
     place = loc = (*at, *first.loc)
@@ -579,7 +585,8 @@ class Document:
         try:
             return model.model_validate(data, context=context)
         except ValidationError as error:
-            raise ConfigError(broken_rules(error, model, self.where, at, data)) from None
+            broken = broken_rules(error, model, self.where, at, data)
+            raise ConfigError(sorted(broken, key=_line)) from None
 
 
 def load_document(path: Path, files: TextFiles | None = None) -> Document:

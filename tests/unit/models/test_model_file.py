@@ -66,12 +66,12 @@ def test_dump_is_plain_yaml():
 def test_every_problem_is_told_at_once():
     text = RDPI.replace("2.7", "1_3").replace("0.1]", ".nan]").replace("gamma_s", "gama_s")
     assert problems_of(text + "  input_unit: mA\n  output_offset_um: .inf\n") == [
-        "m.yaml:7: model.input_unit: must be one of 'A' or 'V', got 'mA'",
-        "m.yaml:8: model.output_offset_um: must be a finite number, got inf",
         "m.yaml:3: model.direct: must be a number, got '1_3' "
         "(write a plain number, such as 1000, 0.5 or 1e-3)",
         "m.yaml:4: model.weights.1: must be a finite number, got nan",
         "m.yaml:6: model.gama_s: unknown key (did you mean 'gamma_s'?)",
+        "m.yaml:7: model.input_unit: must be one of 'A' or 'V', got 'mA'",
+        "m.yaml:8: model.output_offset_um: must be a finite number, got inf",
     ]
 
 
