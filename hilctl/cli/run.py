@@ -155,7 +155,8 @@ def _detach(
     elif started.run is None:
         print(f"run already ended; recording: {started.recording}; log: {started.log}")
     else:
-        print(f"{started.run.card.name} is running; recording: {started.run.card.recording}")
+        files = ", ".join(map(str, started.run.card.recordings))
+        print(f"{started.run.card.name} is running; recording: {files}")
         print("  hilctl status    hilctl set gain=0.5 --over 2    hilctl stop")
 
 

@@ -7,9 +7,7 @@ from dataclasses import replace
 from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.formatting import did_you_mean
 from hilctl.base.yaml import Document, Loc, dotted, loc_of
-from hilctl.experiment.file import AXIS_NAME, MAX_AXES, AxisKeys, Experiment
-
-_RUN_KEYS = Experiment.model_fields.keys() - AxisKeys.model_fields.keys()
+from hilctl.experiment.file import AXIS_NAME, MAX_AXES, RUN_KEYS
 
 
 def names_text(names: Sequence[str]) -> str:
@@ -106,7 +104,7 @@ def _problems(document: Document) -> Iterator[ConfigProblem]:
             yield document.problem(f"axes.{name}", "must hold keys of the experiment")
         else:
             rule, hint = "is the same for all axes", "set it at the top of the file"
-            for key in sorted(keys.keys() & _RUN_KEYS):
+            for key in sorted(keys.keys() & RUN_KEYS):
                 problem = document.problem(f"axes.{name}.{key}", rule, hint=hint)
                 yield replace(problem, where=f"{problem.where}, {name}")
 

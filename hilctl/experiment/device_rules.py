@@ -96,7 +96,7 @@ def channel_problems(channels: Iterable[AuxChannel]) -> Iterator[ConfigProblem]:
         seen.add(channel.name)
 
 
-def same_output_problems(axes: Mapping[str, DeviceInfo]) -> Iterator[tuple[str, ConfigProblem]]:
+def output_problems(axes: Mapping[str, DeviceInfo]) -> Iterator[tuple[str, ConfigProblem]]:
     """Yield the axes that drive the output of an earlier one, with the broken rule."""
     for (first, one), (second, other) in combinations(axes.items(), 2):
         shared = sorted(set(one.holds) & set(other.holds))
@@ -108,29 +108,28 @@ def same_output_problems(axes: Mapping[str, DeviceInfo]) -> Iterator[tuple[str, 
 
 def clock_problems(
     axes: Mapping[str, DeviceInfo], rate_hz: float, block: int
-) -> Iterator[ConfigProblem]:
-    """Yield the broken rules on the devices of several axes, which one clock must drive.
+) -> Iterator[tuple[str, ConfigProblem]]:
+    """Yield the broken rules on the devices of several axes on one clock, each with an axis.
 
     Simulated devices step on the sample count: they have no clocks, and take no time.
     """
-    if len({(each.buffered, each.latency_blocks) for each in axes.values()}) > 1:
-        rule = "all devices must have a FIFO, or none, and the same latency in blocks"
-        found = (f"{name} {each.latency_blocks}" for name, each in axes.items())
-        yield broken("axes", rule, ", ".join(found))
+    first, info = next(iter(axes.items()))
+    for name, each in axes.items():
+        if (each.buffered, each.latency_blocks) != (info.buffered, info.latency_blocks):
+            yield name, broken("device", f"must have a FIFO and a latency as that of {first}")
     real = {name: each for name, each in axes.items() if not each.simulated}
     clocks = {each.holds: name for name, each in real.items() if each.buffered}
     if block > 1 and len(clocks) > 1:
         rule = f"must be 1: {names_text([*clocks.values()])} have clocks of their own, which drift "
         hint = "two outputs of one device may stream"
-        yield broken("block", f"{rule}apart", str(block), hint)
+        yield first, broken("block", f"{rule}apart", str(block), hint)
     turn_s = {name: 1.0 / each.max_rate_hz for name, each in real.items()}
     total_s = sum(turn_s.values())
     if len(real) > 1 and rate_hz * total_s > 1.0:
         each_ms = ", ".join(f"{name} {1e3 * duration_s:.3g}" for name, duration_s in turn_s.items())
-        rule = f"must be <= {1.0 / total_s:.4g}"
         hint = f"the axes are exchanged in turn, in ms: {each_ms}"
-        yield broken("sample_rate_hz", rule, f"{rate_hz:g}", hint)
-    if real:
-        verb = "is" if len(real) == 1 else "are"
-        hint = f"{names_text([*real])} {verb} real: add --set axis={next(iter(real))} to run one"
-        yield broken("axes", "several axes run on simulated devices only", hint=hint)
+        rule = f"must be <= {1.0 / total_s:.4g}"
+        yield first, broken("sample_rate_hz", rule, f"{rate_hz:g}", hint)
+    for name, each in [*real.items()][:1]:
+        rule = "must be simulated in a run of several axes"
+        yield name, broken("device", rule, each.name, f"--set axis={name} runs this one alone")

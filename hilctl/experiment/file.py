@@ -32,6 +32,9 @@ from hilctl.waveforms.spec import AnyWaveform
 AXIS_NAME = "[a-z][a-z0-9_]*"
 """Pattern of the names of axes."""
 MAX_AXES = 8
+RUN_KEYS = {"name", "description", "labels", "sample_rate_hz", "block", "trigger", "timing",
+            "recording", "realtime"}  # fmt: skip
+"""Keys of an experiment that are the same for all axes."""
 _NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
 
 
@@ -49,13 +52,18 @@ Name = Annotated[
 ]
 
 
-class AxisKeys(StrictModel):
-    """The keys of one axis, which differ between the axes of an experiment with ``axes``.
+class Experiment(StrictModel):
+    """One experiment with one axis, or one axis of an experiment with the keys of its run.
 
     Attributes:
+        name: Short name, part of the recording's file name.
+        description: Purpose in words.
+        labels: Labels for searches of runs, such as operator, sample or temperature.
         device: ``kind`` and the device's own options.
         amplifier: Largest voltage of the amplifier that drives the coil, for devices driven in A.
             A run that needs more is refused. Default: not checked.
+        sample_rate_hz: Samples per second.
+        block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
         waveform: The reference.
         compensator: ``none``, or the model to invert.
         condition: Cycle before the waveform that erases the history of the actuator. Default: none.
@@ -64,12 +72,22 @@ class AxisKeys(StrictModel):
             ``limits.stroke_um``.
         feedback: Controller around the compensator. Default: none.
         adaptation: Adaptation of the compensator's model during the run. Default: none.
+        trigger: Digital output at marks of the waveform, and start by a digital input. Default:
+            none. Of several axes, the first one has the marks and the channels.
         limits: Limits of the run.
         safe: The safe value, and the safe ramp to it.
+        timing: Policy for late ticks.
+        recording: Recording of the run.
+        realtime: Real-time settings of the loop process.
     """
 
+    name: Name
+    description: str = ""
+    labels: Labels = Field(default_factory=dict)
     device: dict[str, Any]
     amplifier: VoltageLimit | None = None
+    sample_rate_hz: Annotated[float, Field(ge=1e-3, le=1e6)]
+    block: Annotated[int, Field(ge=1, le=4096)] = 1
     waveform: AnyWaveform
     compensator: Annotated[
         CompensatorConfig | None,
@@ -81,32 +99,9 @@ class AxisKeys(StrictModel):
     zero: bool = False
     feedback: FeedbackConfig | None = None
     adaptation: AdaptationConfig | None = None
+    trigger: Trigger | None = None
     limits: Limits
     safe: Safe = Field(default_factory=Safe)
-
-
-class Experiment(AxisKeys):
-    """One experiment with one axis, or one axis of an experiment with the keys of its run.
-
-    Attributes:
-        name: Short name, part of the recording's file name.
-        description: Purpose in words.
-        labels: Labels for searches of runs, such as operator, sample or temperature.
-        sample_rate_hz: Samples per second.
-        block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
-        trigger: Digital output at marks of the waveform, and start by a digital input. Default:
-            none. Of several axes, the first one has the marks and the channels.
-        timing: Policy for late ticks.
-        recording: Recording of the run.
-        realtime: Real-time settings of the loop process.
-    """
-
-    name: Name
-    description: str = ""
-    labels: Labels = Field(default_factory=dict)
-    sample_rate_hz: Annotated[float, Field(ge=1e-3, le=1e6)]
-    block: Annotated[int, Field(ge=1, le=4096)] = 1
-    trigger: Trigger | None = None
     timing: Timing = Field(default_factory=Timing)
     recording: RecordingConfig = Field(default_factory=RecordingConfig)
     realtime: Realtime = Field(default_factory=Realtime)
@@ -165,7 +160,8 @@ def experiment_schema() -> dict[str, Any]:
         definitions[f"device_{kind}"] = part
         choices.append({"$ref": f"#/$defs/device_{kind}"})
     one["properties"]["device"] = {"oneOf": choices, "description": "kind and its options"}
-    parts = {key: _part(one["properties"][key], definitions) for key in AxisKeys.model_fields}
+    own = [key for key in one["properties"] if key not in RUN_KEYS]
+    parts = {key: _part(one["properties"][key], definitions) for key in own}
     axis = {"type": "object", "properties": parts, "additionalProperties": False}
     axes = {
         "type": "object",
@@ -175,7 +171,7 @@ def experiment_schema() -> dict[str, Any]:
         "maxProperties": MAX_AXES,
         "additionalProperties": axis,
     }
-    required = [key for key in one["required"] if key not in AxisKeys.model_fields]
+    required = [key for key in one["required"] if key in RUN_KEYS]
     of_all = {"properties": {**one["properties"], **parts, "axes": axes}, "required": required}
     definitions |= {"Experiment": one, "Experiment_of_axes": {**one, **of_all}}
     return {

@@ -37,8 +37,8 @@ from hilctl.experiment.device_rules import (
     calibration_warnings,
     channel_problems,
     clock_problems,
+    output_problems,
     rate_problems,
-    same_output_problems,
     watchdog_problems,
 )
 from hilctl.experiment.device_state import heat_before, start_of
@@ -195,14 +195,14 @@ def check_axes(loaded: Sequence[LoadedExperiment], heat_a2: float | None = 0.0) 
 
 def _joint_problems(loaded: Sequence[LoadedExperiment]) -> Iterator[ConfigProblem]:
     """Yield the broken rules on the axes together, with their places."""
-    first, documents = loaded[0], {each.axis: each.document for each in loaded}
+    config, documents = loaded[0].config, {each.axis: each.document for each in loaded}
     infos = {each.axis: each.device.info for each in loaded}
     if len(infos) < 2:
         return
-    for axis, problem in same_output_problems(infos):
+    found = [*output_problems(infos)]
+    found += clock_problems(infos, config.sample_rate_hz, config.block)
+    for axis, problem in found:
         yield from documents[axis].refusal([problem]).problems
-    rate_hz, block = first.config.sample_rate_hz, first.config.block
-    yield from first.document.refusal(clock_problems(infos, rate_hz, block)).problems
 
 
 def check(

@@ -8,7 +8,7 @@ import pytest
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
 from hilctl.experiment.axes import axis_documents, with_settings
-from hilctl.experiment.device_rules import clock_problems, same_output_problems
+from hilctl.experiment.device_rules import clock_problems, output_problems
 from hilctl.experiment.load import input_files, inputs_of, load_axes, load_experiment
 from hilctl.experiment.preflight import check_axes
 
@@ -157,25 +157,27 @@ def real():
 
 
 def test_two_axes_never_drive_one_output(real):
-    assert not [*same_output_problems(real)]
-    ((axis, problem),) = same_output_problems(real | {"y": real["x"]})
+    assert not [*output_problems(real)]
+    ((axis, problem),) = output_problems(real | {"y": real["x"]})
     assert (axis, problem.key) == ("y", "device.output")
     assert problem.rule.startswith("DAC0 of ")
-    assert not [*same_output_problems(real | {"y": replace(real["x"], holds=("tcp:other",))})]
+    assert not [*output_problems(real | {"y": replace(real["x"], holds=("tcp:other",))})]
 
 
 def test_real_devices_of_several_axes(real):
     def keys(infos, rate_hz=1.0, block=1):
-        return [each.key for each in clock_problems(infos, rate_hz, block)]
+        return [(axis, each.key) for axis, each in clock_problems(infos, rate_hz, block)]
 
     rate_hz = real["x"].max_rate_hz
-    assert keys(real) == ["axes"]
-    assert keys(real, rate_hz / 2.1) == ["axes"]
-    assert keys(real, rate_hz / 1.9) == ["sample_rate_hz", "axes"]
+    alone = ("x", "device")
+    assert keys(real) == [alone]
+    assert keys(real, rate_hz / 2.1) == [alone]
+    assert keys(real, rate_hz / 1.9) == [("x", "sample_rate_hz"), alone]
     fifo = {name: replace(each, buffered=True, holds=(name,)) for name, each in real.items()}
-    assert keys(fifo, block=2) == ["block", "axes"]
-    assert keys(fifo) == ["axes"]
-    assert keys(real | {"y": replace(real["y"], latency_blocks=2)}) == ["axes", "axes"]
+    assert keys(fifo, block=2) == [("x", "block"), alone]
+    assert keys(fifo) == [alone]
+    late = {"y": replace(real["y"], latency_blocks=2)}
+    assert keys(real | late) == [("y", "device"), alone]
 
 
 def test_simulated_axes_take_no_time():
@@ -190,5 +192,6 @@ def test_real_axes_are_refused_together_and_run_alone(tmp_path):
     (tmp_path / "models").symlink_to(CONFIGS / "models")
     own = tmp_path / "t7.yaml"
     own.write_text(text + "axes:\n  x: {}\n  y: {device: {output: DAC1}}\n", encoding="utf-8")
-    assert [each.key for each in refused(own)] == ["axes"]
+    (problem,) = refused(own)
+    assert (problem.where, problem.key) == (f"{own}:10", "device")
     assert load_experiment(own, ["axis=x"]).config == load_experiment(path).config
