@@ -10,8 +10,8 @@ from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable, is_folder, write_text
 from hilctl.base.table import Column
 from hilctl.base.yaml import Settings, texts_of
-from hilctl.experiment.correction import write_correction
 from hilctl.experiment.load import inputs_of
+from hilctl.experiment.sections.correction import write_correction
 from hilctl.lab.studies.calibrate import (
     CalibrationFit,
     Origin,

@@ -9,7 +9,7 @@ from hilctl.api._types import PathLike, Paths, paths_of
 from hilctl.api.recordings import RecordedRun, read
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_writable
-from hilctl.experiment.open_loop import write_response
+from hilctl.experiment.sections.open_loop import write_response
 from hilctl.lab.response.bode import write_responses
 from hilctl.lab.response.feedback_design import (
     FeedbackDesign,

@@ -30,7 +30,7 @@ from hilctl.cli.options import (
     experiment_keys,
 )
 from hilctl.cli.output import print_json, print_result
-from hilctl.experiment.labels import label_settings
+from hilctl.experiment.sections.labels import label_settings
 from hilctl.lab.studies.campaign.campaign_runner import CampaignResult
 from hilctl.lab.studies.campaign.plan import CampaignPlan
 from hilctl.lab.studies.campaign.steps import (

@@ -24,7 +24,7 @@ from hilctl.cli.options import (
     Settings,
 )
 from hilctl.cli.output import print_json, print_result
-from hilctl.experiment.labels import label_settings
+from hilctl.experiment.sections.labels import label_settings
 from hilctl.lab.studies.calibrate import CalibrationFit
 from hilctl.lab.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.lab.studies.characterise.results import Characterisation, StepRow

@@ -28,8 +28,8 @@ from hilctl.cli.console import compile_progress, console, listing, progress_bar
 from hilctl.cli.options import AsJson, ExperimentFile, LabelTexts, Overwrite, Settings
 from hilctl.cli.output import Verbosity, print_json, print_result
 from hilctl.cli.reports import render_report
-from hilctl.experiment.labels import label_settings
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
+from hilctl.experiment.sections.labels import label_settings
 from hilctl.loop.interlocks import for_longer_than
 from hilctl.loop.safe_output import describe
 from hilctl.machine.diagnosis import log_out

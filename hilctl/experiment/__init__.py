@@ -1,9 +1,10 @@
 """The experiment file, everything it refers to, and its check before a run. Moves nothing."""
 
 PUBLIC = (
-    "adaptation", "axes", "coil_heat", "compensator", "conditioning", "correction", "device_state",
-    "devices", "examples", "feedback", "file", "forecast", "labels", "load", "model_validity",
-    "open_loop", "preflight", "recording_settings", "rig", "safe", "state_files", "template",
-    "timing",
+    "axes", "coil_heat", "device_state", "devices", "examples", "file", "forecast", "load",
+    "model_validity", "preflight", "rig", "sections.adaptation", "sections.compensator",
+    "sections.conditioning", "sections.correction", "sections.feedback", "sections.labels",
+    "sections.open_loop", "sections.recording_settings", "sections.safe", "sections.timing",
+    "state_files", "template",
 )  # fmt: skip
 """Modules that other rooms import; the others are private."""

@@ -19,10 +19,10 @@ from hilctl.base.errors import ConfigProblem, DataError, InputError, broken
 from hilctl.base.samples import Flag
 from hilctl.base.types import F64
 from hilctl.experiment.coil_heat import CoilHeat, cooled
-from hilctl.experiment.compensator import CompensatorStart, InitialState, begin, left_by
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.limits import Limits
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.sections.compensator import CompensatorStart, InitialState, begin, left_by
+from hilctl.experiment.sections.limits import Limits
 from hilctl.experiment.state_files import (
     CoilState,
     LastRun,

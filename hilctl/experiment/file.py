@@ -12,18 +12,18 @@ from hilctl.base.strict import (
     StrictModel,
     WithJsonSchema,
 )
-from hilctl.experiment.adaptation import AdaptationConfig
-from hilctl.experiment.compensator import CompensatorConfig, none_or_mapping
-from hilctl.experiment.conditioning import Condition
 from hilctl.experiment.devices import known_devices, options_schema
-from hilctl.experiment.feedback import FeedbackConfig
-from hilctl.experiment.labels import Labels
-from hilctl.experiment.limits import Limits
-from hilctl.experiment.recording_settings import RecordingConfig
 from hilctl.experiment.rig import Exchange, RunRig
-from hilctl.experiment.safe import Safe
-from hilctl.experiment.timing import Timing
-from hilctl.experiment.trigger import Trigger
+from hilctl.experiment.sections.adaptation import AdaptationConfig
+from hilctl.experiment.sections.compensator import CompensatorConfig, none_or_mapping
+from hilctl.experiment.sections.conditioning import Condition
+from hilctl.experiment.sections.feedback import FeedbackConfig
+from hilctl.experiment.sections.labels import Labels
+from hilctl.experiment.sections.limits import Limits
+from hilctl.experiment.sections.recording_settings import RecordingConfig
+from hilctl.experiment.sections.safe import Safe
+from hilctl.experiment.sections.timing import Timing
+from hilctl.experiment.sections.trigger import Trigger
 from hilctl.loop.adaptation import AdaptationBounds
 from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.rt_setup import Realtime

@@ -13,8 +13,8 @@ import numpy as np
 
 from hilctl.base.types import CHUNK, F64
 from hilctl.experiment.coil_heat import CoilHeat, RunHeat
-from hilctl.experiment.compensator import CompensatorStart
 from hilctl.experiment.rig import RunRig
+from hilctl.experiment.sections.compensator import CompensatorStart
 from hilctl.kernels.dynamics import lag_block
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.tuning import LinearBypass

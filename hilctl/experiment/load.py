@@ -22,13 +22,13 @@ from hilctl.experiment.axes import (
     problems_of_axes,
     with_settings,
 )
-from hilctl.experiment.conditioning import make_conditioning
-from hilctl.experiment.correction import Correction, load_correction
 from hilctl.experiment.devices import made_device
 from hilctl.experiment.file import AXIS_NAME, Experiment
-from hilctl.experiment.open_loop import MeasuredResponse, load_response
 from hilctl.experiment.rig import RunRig
-from hilctl.experiment.safe import safe_problems
+from hilctl.experiment.sections.conditioning import make_conditioning
+from hilctl.experiment.sections.correction import Correction, load_correction
+from hilctl.experiment.sections.open_loop import MeasuredResponse, load_response
+from hilctl.experiment.sections.safe import safe_problems
 from hilctl.loop.lead_in import Conditioning
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import load_model

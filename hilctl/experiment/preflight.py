@@ -14,25 +14,7 @@ import numpy as np
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
-from hilctl.experiment.adaptation import (
-    adaptation_problems,
-    adaptation_warnings,
-    adapted_operator,
-    at_worst,
-    worst_inputs,
-)
 from hilctl.experiment.axes import problems_of_axes
-from hilctl.experiment.compensator import (
-    CompensatorStart,
-    finite_problems,
-    identified_um,
-    lead_in_problems,
-    model_problems,
-    rests_at,
-    start_problems,
-)
-from hilctl.experiment.conditioning import condition_problems, zero_problems
-from hilctl.experiment.cures import Course, cured
 from hilctl.experiment.device_rules import (
     calibration_warnings,
     channel_problems,
@@ -42,10 +24,30 @@ from hilctl.experiment.device_rules import (
     watchdog_problems,
 )
 from hilctl.experiment.device_state import heat_before, start_of
-from hilctl.experiment.feedback import feedback_problems
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.forecast import Forecast, forecast_of
-from hilctl.experiment.limits import (
+from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.model_validity import ExpectedError, range_findings
+from hilctl.experiment.sections.adaptation import (
+    adaptation_problems,
+    adaptation_warnings,
+    adapted_operator,
+    at_worst,
+    worst_inputs,
+)
+from hilctl.experiment.sections.compensator import (
+    CompensatorStart,
+    finite_problems,
+    identified_um,
+    lead_in_problems,
+    model_problems,
+    rests_at,
+    start_problems,
+)
+from hilctl.experiment.sections.conditioning import condition_problems, zero_problems
+from hilctl.experiment.sections.cures import Course, cured
+from hilctl.experiment.sections.feedback import feedback_problems
+from hilctl.experiment.sections.limits import (
     Excess,
     clamp_warnings,
     command_excess,
@@ -53,17 +55,15 @@ from hilctl.experiment.limits import (
     range_problems,
     reference_excess,
 )
-from hilctl.experiment.load import LoadedExperiment
-from hilctl.experiment.model_validity import ExpectedError, range_findings
-from hilctl.experiment.safe import at_start_problems, start_warnings
-from hilctl.experiment.state_files import MachineTime
-from hilctl.experiment.timing import (
+from hilctl.experiment.sections.safe import at_start_problems, start_warnings
+from hilctl.experiment.sections.timing import (
     SilenceLimits,
     pace_warnings,
     silence_limits,
     timeout_warnings,
 )
-from hilctl.experiment.trigger import mark_problems, trigger_problems
+from hilctl.experiment.sections.trigger import mark_problems, trigger_problems
+from hilctl.experiment.state_files import MachineTime
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.lead_in import Conditioning
 from hilctl.waveforms.build import Reference, build

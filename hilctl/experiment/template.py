@@ -25,9 +25,9 @@ from hilctl.experiment.devices import (
     made_device,
     shipped_profiles,
 )
-from hilctl.experiment.feedback import rounded_down
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
+from hilctl.experiment.sections.feedback import rounded_down
 
 STARTING_SECTION = "hilctl_drivers.template:starting_section"
 _CHANNELS = ("output", "input")

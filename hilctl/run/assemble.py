@@ -5,10 +5,10 @@ from collections.abc import Sequence
 
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
-from hilctl.experiment.adaptation import make_adaptation
-from hilctl.experiment.feedback import make_feedback
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.experiment.timing import late_policy, late_rules
+from hilctl.experiment.sections.adaptation import make_adaptation
+from hilctl.experiment.sections.feedback import make_feedback
+from hilctl.experiment.sections.timing import late_policy, late_rules
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.lead_in import Conditioning

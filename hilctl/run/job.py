@@ -21,7 +21,7 @@ from hilctl.base.files import TextFiles
 from hilctl.base.types import F64
 from hilctl.base.yaml import Document
 from hilctl.experiment.devices import made_device
-from hilctl.experiment.timing import SilenceLimits
+from hilctl.experiment.sections.timing import SilenceLimits
 
 if TYPE_CHECKING:
     from hilctl.experiment.file import Experiment

@@ -22,7 +22,7 @@ from hilctl.base.files import TextFiles
 from hilctl.base.segments import Segment
 from hilctl.base.subprocesses import python_command
 from hilctl.experiment.load import LoadedExperiment, resolve
-from hilctl.experiment.safe import starting_output
+from hilctl.experiment.sections.safe import starting_output
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import SystemClock

@@ -25,8 +25,8 @@ from hilctl.base.events import ADAPTED, Event
 from hilctl.base.files import already_there, reason, sync_folder
 from hilctl.base.samples import BlockBatch, BlockHeader, Samples
 from hilctl.experiment.coil_heat import CoilHeat
-from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
+from hilctl.experiment.sections.correction import dump_correction
 from hilctl.experiment.state_files import CoilState, DeviceState, MachineTime, names_of, write_state
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.procfs import ProcessUsage

@@ -25,9 +25,9 @@ from hilctl import OWN_ENVIRONMENT
 from hilctl.base.errors import DataError, HilctlError, InputError, RunError
 from hilctl.base.files import check_no_input, make_folder
 from hilctl.base.subprocesses import python_command
-from hilctl.experiment.correction import dump_correction
 from hilctl.experiment.load import LoadedExperiment, input_files, load_axes, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun, check, check_axes
+from hilctl.experiment.sections.correction import dump_correction
 from hilctl.machine.reserve import RESERVE
 from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends

@@ -17,7 +17,7 @@ from hilctl.base.errors import DeviceError, HilctlError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, Samples
 from hilctl.experiment.preflight import CheckedRun
-from hilctl.experiment.safe import starting_output
+from hilctl.experiment.sections.safe import starting_output
 from hilctl.loop.block import Block
 from hilctl.loop.loop import Loop
 from hilctl.loop.pacer import Lateness

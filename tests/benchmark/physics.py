@@ -23,8 +23,8 @@ import numpy as np
 
 from hilctl import api
 from hilctl.base.types import F64
-from hilctl.experiment.compensator import begin, rests_at
 from hilctl.experiment.load import load_experiment
+from hilctl.experiment.sections.compensator import begin, rests_at
 from hilctl.loop.compensator import Compensator
 from hilctl.models.base import HysteresisModel, stroke_class
 from hilctl.models.model_file import load_model

@@ -13,7 +13,7 @@ from pathlib import Path
 from unittest.mock import patch
 
 from hilctl.base.samples import BlockBatch
-from hilctl.experiment.recording_settings import RecordingConfig
+from hilctl.experiment.sections.recording_settings import RecordingConfig
 from hilctl.recording.encoder import RecordingLayout
 from hilctl.recording.writer import RecordingWriter, RunFacts
 from hilctl.run.recorder import Recorder

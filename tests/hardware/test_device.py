@@ -26,7 +26,7 @@ import pytest
 from hilctl.base.device import WatchdogDevice
 from hilctl.base.errors import DeviceError
 from hilctl.experiment.load import LoadedExperiment, load_experiment
-from hilctl.experiment.safe import starting_output
+from hilctl.experiment.sections.safe import starting_output
 from hilctl.loop.limiter import CommandLimits, Limiter
 from hilctl.loop.pacer import SystemClock
 from hilctl.run.probe import probe

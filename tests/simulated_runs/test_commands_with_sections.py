@@ -13,7 +13,7 @@ import yaml
 from hilctl import api
 from hilctl.base.errors import HilctlError
 from hilctl.experiment.file import Experiment
-from hilctl.experiment.limits import Limits
+from hilctl.experiment.sections.limits import Limits
 from tests import commands
 from tests.commands import Ended, in_process
 from tests.unit.base.test_calibration import AMPLIFIER, CALIBRATION

@@ -11,9 +11,9 @@ from typer.testing import CliRunner
 from hilctl.analysis.replay import replay
 from hilctl.analysis.report import summarize
 from hilctl.cli.commands import app
-from hilctl.experiment.correction import load_correction
 from hilctl.experiment.load import load_experiment
 from hilctl.experiment.preflight import CheckedRun
+from hilctl.experiment.sections.correction import load_correction
 from hilctl.lab.studies.learn import IlcSession
 from hilctl.lab.studies.study import REPEATS, StudyHost, run_study
 from hilctl.models.linear_stages import FirstMode

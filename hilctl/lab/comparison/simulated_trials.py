@@ -12,8 +12,8 @@ import numpy as np
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.samples import Flag
 from hilctl.base.types import F64, U32
-from hilctl.experiment.compensator import begin
 from hilctl.experiment.load import LoadedExperiment
+from hilctl.experiment.sections.compensator import begin
 from hilctl.lab.identify.data.records import SteadyLoop
 from hilctl.loop.interlocks import AuxLimit, InterlockContext, InterlockSettings
 from hilctl.models.base import HysteresisModel

@@ -18,21 +18,21 @@ from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import write_text
 from hilctl.base.formatting import quantity, shown_briefly
 from hilctl.base.yaml import Document, commented
-from hilctl.experiment.adaptation import OFFSET_SHARE
-from hilctl.experiment.feedback import (
+from hilctl.experiment.file import Experiment
+from hilctl.experiment.rig import Exchange
+from hilctl.experiment.sections.adaptation import OFFSET_SHARE
+from hilctl.experiment.sections.feedback import (
     IntegralFeedbackConfig,
     PiFeedbackConfig,
     bandwidth_of,
     feedback_gains,
     rounded_down,
 )
-from hilctl.experiment.file import Experiment
-from hilctl.experiment.open_loop import (
+from hilctl.experiment.sections.open_loop import (
     ASSUMED_PHASE_MARGIN_DEG,
     LoopResponse,
     MeasuredResponse,
 )
-from hilctl.experiment.rig import Exchange
 from hilctl.lab.pages import html
 from hilctl.lab.pages.figure_layout import FigureSpec, Panel
 from hilctl.lab.pages.plot_style import DISPLACEMENT, MARK, REFERENCE, plain_numbers

@@ -15,14 +15,14 @@ from hilctl.base.formatting import shown_briefly
 from hilctl.base.segments import Segment
 from hilctl.base.types import C128
 from hilctl.base.yaml import setting
-from hilctl.experiment.correction import (
+from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.sections.correction import (
     Correction,
     LearnedCycle,
     fits,
     signature,
     write_correction,
 )
-from hilctl.experiment.preflight import CheckedExperiment
 from hilctl.lab.ilc.cycle import CycleScore, cycle_error, harmonic_count
 from hilctl.lab.ilc.update import IlcState, learn, refused
 from hilctl.lab.studies.study import StepStoppedError, Study, StudyStep

@@ -30,7 +30,7 @@ from types import FrameType
 
 from hilctl.base.device import Device
 from hilctl.base.errors import HilctlError
-from hilctl.experiment.timing import SilenceLimits
+from hilctl.experiment.sections.timing import SilenceLimits
 from hilctl.loop.safe_output import (
     PATIENT_AFTER_S,
     PATIENT_PAUSE_S,

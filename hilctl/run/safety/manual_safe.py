@@ -14,7 +14,7 @@ from hilctl.base.files import TextFiles
 from hilctl.base.yaml import load_document
 from hilctl.experiment.axes import one_axis_document, with_settings
 from hilctl.experiment.devices import made_device
-from hilctl.experiment.safe import Safe
+from hilctl.experiment.sections.safe import Safe
 from hilctl.loop.safe_output import (
     PATIENCE_S,
     LocalError,

@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.cli.campaigns import print_campaign, print_row, sweep_document
-from hilctl.experiment.correction import Correction, LearnedCycle
+from hilctl.experiment.sections.correction import Correction, LearnedCycle
 from hilctl.lab.studies.campaign.campaign_runner import CampaignResult
 from hilctl.lab.studies.campaign.plan import planned
 from hilctl.lab.studies.campaign.steps import CampaignStep, load_campaign

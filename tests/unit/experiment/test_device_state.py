@@ -12,7 +12,6 @@ from hilctl.base.errors import ConfigError, DataError
 from hilctl.base.samples import COLUMNS, BlockBatch, BlockHeader, Flag
 from hilctl.base.yaml import Document
 from hilctl.experiment.coil_heat import CoilHeat
-from hilctl.experiment.compensator import InitialState, left_by
 from hilctl.experiment.device_state import (
     finish_state,
     heat_after,
@@ -22,6 +21,7 @@ from hilctl.experiment.device_state import (
 )
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
+from hilctl.experiment.sections.compensator import InitialState, left_by
 from hilctl.experiment.state_files import (
     CoilState,
     DeviceState,

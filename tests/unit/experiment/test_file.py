@@ -13,9 +13,9 @@ from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.yaml import Document
 from hilctl.experiment import devices as registry
 from hilctl.experiment.file import Name
-from hilctl.experiment.limits import Interval
 from hilctl.experiment.load import load_experiment, resolve
-from hilctl.experiment.timing import Timing
+from hilctl.experiment.sections.limits import Interval
+from hilctl.experiment.sections.timing import Timing
 
 FULL = """\
 name: full_example

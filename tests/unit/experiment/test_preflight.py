@@ -12,11 +12,11 @@ from pydantic import ConfigDict
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
 from hilctl.experiment import preflight as module
-from hilctl.experiment.compensator import CompensatorConfig
-from hilctl.experiment.correction import Correction, LearnedCycle, signature
 from hilctl.experiment.load import load_experiment, resolve
 from hilctl.experiment.model_validity import UNKNOWN
 from hilctl.experiment.preflight import check
+from hilctl.experiment.sections.compensator import CompensatorConfig
+from hilctl.experiment.sections.correction import Correction, LearnedCycle, signature
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Operator, Provenance
 from hilctl.models.model_file import model_sha256
 from hilctl.models.plays import RdpiModel

@@ -2,7 +2,7 @@
 
 import pytest
 
-from tests.unit.experiment.test_limits import CURRENT, VOLTAGE, loaded
+from tests.unit.experiment.sections.test_limits import CURRENT, VOLTAGE, loaded
 
 
 def test_rig():

@@ -9,8 +9,8 @@ from hypothesis import strategies as st
 
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
-from hilctl.experiment.feedback import PiFeedbackConfig, gains_for, make_feedback
 from hilctl.experiment.rig import Exchange
+from hilctl.experiment.sections.feedback import PiFeedbackConfig, gains_for, make_feedback
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Feedback, Gains, IntegralFeedback
 from hilctl.loop.limiter import CommandLimits

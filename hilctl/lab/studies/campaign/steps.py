@@ -18,10 +18,10 @@ from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import Document, Loc, dotted, load_document, setting, texts_of
-from hilctl.experiment.conditioning import Condition
 from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.file import Name
 from hilctl.experiment.load import LoadedExperiment, document_with, named_from, resolve
+from hilctl.experiment.sections.conditioning import Condition
 
 RunOrder = Literal["as_written", "random", "alternating"]
 

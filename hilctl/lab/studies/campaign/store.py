@@ -14,7 +14,7 @@ from hilctl.analysis.export import write_parquet
 from hilctl.base.files import write_file, write_text
 from hilctl.base.yaml import texts_of
 from hilctl.experiment.load import document_with
-from hilctl.experiment.recording_settings import RecordingConfig
+from hilctl.experiment.sections.recording_settings import RecordingConfig
 from hilctl.lab.studies.campaign.plan import CampaignPlan
 from hilctl.lab.studies.campaign.steps import CampaignStep, CampaignSteps, cell
 from hilctl.lab.studies.multi_run.collect import (

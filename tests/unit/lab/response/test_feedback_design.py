@@ -10,7 +10,7 @@ from hilctl.base.segments import Segment
 from hilctl.base.yaml import Document, dump
 from hilctl.lab.response.feedback_design import design_feedback, write_design
 from hilctl.loop.feedback import MOST_GAIN_PER_BLOCK
-from tests.unit.experiment.test_adaptation import MODEL, PLAIN
+from tests.unit.experiment.sections.test_adaptation import MODEL, PLAIN
 from tests.unit.loop.test_feedback import EXPERIMENT
 
 RATE_HZ, PERIOD, PERIODS = 5000.0, 1000, 6

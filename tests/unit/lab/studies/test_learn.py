@@ -10,7 +10,7 @@ import pytest
 from hilctl.analysis.report import summarize
 from hilctl.base.errors import ConfigError, RunError
 from hilctl.base.segments import Segment
-from hilctl.experiment.correction import Correction, LearnedCycle, load_correction
+from hilctl.experiment.sections.correction import Correction, LearnedCycle, load_correction
 from hilctl.lab.ilc.cycle import CycleScore
 from hilctl.lab.ilc.update import IlcState
 from hilctl.lab.studies.learn import (

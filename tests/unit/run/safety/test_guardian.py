@@ -16,7 +16,7 @@ from unittest.mock import Mock
 import pytest
 
 from hilctl.base.errors import DeviceError
-from hilctl.experiment.timing import SilenceLimits
+from hilctl.experiment.sections.timing import SilenceLimits
 from hilctl.loop.safe_output import LoopOutcome, SafeGoal
 from hilctl.run import run_folder
 from hilctl.run.job import AxisJob, Job

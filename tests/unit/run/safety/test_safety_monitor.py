@@ -6,7 +6,7 @@ from unittest.mock import Mock
 import pytest
 
 from hilctl.base.errors import DeviceError, RunError
-from hilctl.experiment.timing import Timing, silence_limits
+from hilctl.experiment.sections.timing import Timing, silence_limits
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run.safety import guardian as actions

@@ -9,9 +9,9 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.feedback import PiFeedbackConfig, feedback_problems
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
+from hilctl.experiment.sections.feedback import PiFeedbackConfig, feedback_problems
 from hilctl.models.model_file import load_model, model_sha256
 from tests.unit.loop.test_feedback import EXPERIMENT
 

@@ -6,8 +6,9 @@ import numpy as np
 import pytest
 
 from hilctl.base.errors import InputError
-from hilctl.experiment.feedback import gains_for
-from hilctl.experiment.open_loop import (
+from hilctl.experiment.rig import Exchange
+from hilctl.experiment.sections.feedback import gains_for
+from hilctl.experiment.sections.open_loop import (
     ASSUMED_PHASE_MARGIN_DEG,
     LEAST_GAIN_MARGIN_DB,
     MeasuredResponse,
@@ -15,7 +16,6 @@ from hilctl.experiment.open_loop import (
     load_response,
     write_response,
 )
-from hilctl.experiment.rig import Exchange
 from hilctl.loop.feedback import Feedback, Gains, IntegralFeedback
 from hilctl.models.linear_stages import FirstMode
 from tests.unit.loop.test_feedback import blocks, plant

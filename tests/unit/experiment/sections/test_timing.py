@@ -7,7 +7,7 @@ import pytest
 
 from hilctl.experiment.load import load_experiment
 from hilctl.experiment.preflight import check
-from hilctl.experiment.timing import (
+from hilctl.experiment.sections.timing import (
     Timing,
     late_rules,
     pace_warnings,
@@ -15,7 +15,7 @@ from hilctl.experiment.timing import (
     timeout_warnings,
 )
 
-DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+DEMO = Path(__file__).parents[4] / "configs" / "demo.yaml"
 TICK_S = 1e-3
 
 

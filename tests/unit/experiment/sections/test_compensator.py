@@ -7,8 +7,8 @@ import pytest
 
 from hilctl.base.errors import ConfigError, DataError
 from hilctl.experiment import device_state
-from hilctl.experiment.compensator import InitialState, left_by
 from hilctl.experiment.preflight import check
+from hilctl.experiment.sections.compensator import InitialState, left_by
 from hilctl.models.base import HysteresisModel, Operator
 from tests.published import terfenol_rdpi
 from tests.unit.experiment.test_preflight import (

@@ -8,8 +8,8 @@ from decimal import ROUND_CEILING, Context
 from hilctl.base.errors import ConfigProblem
 from hilctl.experiment.coil_heat import CoolingCoil
 from hilctl.experiment.forecast import Forecast
-from hilctl.experiment.limits import Excess, Limits
 from hilctl.experiment.rig import RunRig
+from hilctl.experiment.sections.limits import Excess, Limits
 from hilctl.waveforms.build import Reference
 from hilctl.waveforms.spec import AnyWaveform
 

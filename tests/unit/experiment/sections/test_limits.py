@@ -10,9 +10,9 @@ from pydantic import ValidationError
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.limits import Limits
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
+from hilctl.experiment.sections.limits import Limits
 from hilctl.loop.interlocks import Interlocks
 from tests.published import terfenol_rdpi
 
@@ -126,7 +126,7 @@ class TestConsistency:
             text = text.replace("unit: A", "unit: um")
         made = resolve(
             Document("x.yaml", text),
-            Path(__file__).parents[3] / "configs",
+            Path(__file__).parents[4] / "configs",
             [s if "rate" in s else f"limits.{s}" for s in settings],
         )
         interlocks = made.rig.interlocks

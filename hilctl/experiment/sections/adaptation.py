@@ -10,8 +10,8 @@ from hilctl.base.errors import ConfigProblem, broken
 from hilctl.base.segments import Segment
 from hilctl.base.strict import Field, StrictModel
 from hilctl.base.types import F64
-from hilctl.experiment.feedback import LOOP_DELAY, delays
 from hilctl.experiment.rig import RunRig
+from hilctl.experiment.sections.feedback import LOOP_DELAY, delays
 from hilctl.loop.adaptation import Adaptation, AdaptationBounds, DisplacementOperator
 from hilctl.waveforms.build import Reference
 

@@ -6,10 +6,10 @@ import pytest
 from pydantic import ConfigDict, TypeAdapter, ValidationError
 
 from hilctl.base.errors import ConfigError
-from hilctl.experiment.labels import LONGEST_TEXT, MOST_LABELS, Labels, label_settings
 from hilctl.experiment.load import load_experiment
+from hilctl.experiment.sections.labels import LONGEST_TEXT, MOST_LABELS, Labels, label_settings
 
-DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
+DEMO = Path(__file__).parents[4] / "configs" / "demo.yaml"
 LABELS = TypeAdapter(Labels, config=ConfigDict(strict=True))
 
 

@@ -5,12 +5,12 @@ import pytest
 
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.adaptation import adapted_operator, make_adaptation, worst_inputs
 from hilctl.experiment.load import resolve
 from hilctl.experiment.model_validity import UNKNOWN
 from hilctl.experiment.preflight import check
+from hilctl.experiment.sections.adaptation import adapted_operator, make_adaptation, worst_inputs
 from hilctl.loop.adaptation import DisplacementOperator
-from tests.unit.experiment.test_feedback import MODEL
+from tests.unit.experiment.sections.test_feedback import MODEL
 from tests.unit.loop.test_feedback import EXPERIMENT
 
 PLAIN = EXPERIMENT.replace("feedback:", "# feedback:")

@@ -5,7 +5,7 @@ import pytest
 
 from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.segments import Segment
-from hilctl.experiment.correction import (
+from hilctl.experiment.sections.correction import (
     Correction,
     LearnedCycle,
     dump_correction,

@@ -10,7 +10,8 @@ from typing import Annotated, Any, Literal, Self, TypeAlias
 
 from hilctl.base.errors import ConfigProblem, InputError, broken
 from hilctl.base.strict import BeforeValidator, Field, StrictModel, model_validator
-from hilctl.experiment.open_loop import (
+from hilctl.experiment.rig import Exchange, RunRig
+from hilctl.experiment.sections.open_loop import (
     ASSUMED_PHASE_MARGIN_DEG,
     LEAST_GAIN_MARGIN_DB,
     LEAST_PHASE_MARGIN_DEG,
@@ -18,7 +19,6 @@ from hilctl.experiment.open_loop import (
     MeasuredResponse,
     assumed_response,
 )
-from hilctl.experiment.rig import Exchange, RunRig
 from hilctl.loop.feedback import (
     MOST_GAIN_PER_BLOCK,
     Controller,

@@ -16,7 +16,7 @@ from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
 from hilctl.models.model_file import load_model
 
-MODEL = Path(__file__).parents[3] / "configs" / "models" / "terfenol_staged.yaml"
+MODEL = Path(__file__).parents[4] / "configs" / "models" / "terfenol_staged.yaml"
 EXPERIMENT = f"""\
 name: conditioned
 device: {{kind: simulated_terfenol}}

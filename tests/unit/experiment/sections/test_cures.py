@@ -8,8 +8,8 @@ import numpy as np
 import pytest
 
 from hilctl.experiment.coil_heat import RunHeat
-from hilctl.experiment.cures import Course, cured
-from hilctl.experiment.limits import command_excess
+from hilctl.experiment.sections.cures import Course, cured
+from hilctl.experiment.sections.limits import command_excess
 from tests.published import terfenol_rdpi
 from tests.unit.experiment.test_preflight import (
     CURRENT,

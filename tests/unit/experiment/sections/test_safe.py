@@ -8,7 +8,7 @@ import pytest
 
 from hilctl.base.device import DeviceInfo
 from hilctl.base.errors import DeviceError, InputError
-from hilctl.experiment.safe import Safe, start_warnings, starting_output
+from hilctl.experiment.sections.safe import Safe, start_warnings, starting_output
 from tests.unit.experiment.test_preflight import CURRENT, checked, refusals, told
 
 INFO = DeviceInfo("rig", "a rig", "A", -10.0, 10.0, -75.0, 75.0, 1e3)

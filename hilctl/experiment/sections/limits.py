@@ -11,7 +11,7 @@ from hilctl.base.strict import BeforeValidator, Field, model_validator
 from hilctl.base.types import CommandUnit
 from hilctl.experiment.forecast import Forecast
 from hilctl.experiment.rig import RunRig
-from hilctl.experiment.safe import Safe
+from hilctl.experiment.sections.safe import Safe
 from hilctl.loop.interlocks import InterlockRequirement, InterlockSettings
 from hilctl.loop.limiter import CommandLimits
 

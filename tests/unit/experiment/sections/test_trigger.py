@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from hilctl.experiment.trigger import trigger_problems
+from hilctl.experiment.sections.trigger import trigger_problems
 from tests.unit.experiment.test_preflight import CURRENT, checked, loaded, refusals
 
 SHORT = "{kind: sine, amplitude: 1.0, frequency_hz: 1000.0, duration_s: 0.0011}"
