@@ -350,7 +350,7 @@ def _command_problems(course: Course) -> list[ConfigProblem]:
 def _warnings(
     loaded: LoadedExperiment, reference: Reference, forecast: Forecast, now: MachineTime
 ) -> tuple[str, ...]:
-    """Return what may make the run less accurate or less punctual than expected."""
+    """Return warnings: reasons for lower accuracy or more late ticks than expected."""
     config, rig, info = loaded.config, loaded.rig, loaded.device.info
     return (
         *adaptation_warnings(

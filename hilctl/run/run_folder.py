@@ -515,7 +515,7 @@ def locked_run(run: RunFolder) -> Iterator[int]:
 
 @contextmanager
 def taken_over(run: RunFolder) -> Iterator[bool]:
-    """Act for the dead supervisor of a run; yield whether no other command does, or did."""
+    """Act for the dead supervisor of a run; yield False if another command acts or has acted."""
     try:
         descriptor = os.open(run.path / _SUPERVISOR, os.O_RDWR | os.O_CREAT, 0o600)
     except FileNotFoundError:
