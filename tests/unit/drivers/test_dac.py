@@ -72,10 +72,10 @@ def test_a_command_arrives_and_a_reading_comes_back(rig, kind):
 FAULTS = {
     "silence": f"no answer within {TIMEOUT_S:g} s",
     "delay": f"no answer within {TIMEOUT_S:g} s",
-    "corrupt": "checksum of|not an answer to this|crc16_ccitt_false of .* is wrong",
+    "corrupt": "checksum of|does not match this request|crc16_ccitt_false of .* is wrong",
     "cut": rf"only . bytes, \d+ short, within {TIMEOUT_S:g} s",
-    "duplicate": "must be one line|bytes behind",
-    "wrong_id": "not an answer to this|reply 90 to message",
+    "duplicate": "must be one line|after the end of the frame",
+    "wrong_id": "does not match this request|reply 90 to message",
     "exception": "invalid command|no answer within|refused by the board",
 }
 
