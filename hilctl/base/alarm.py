@@ -6,14 +6,14 @@ from collections.abc import Callable, Iterator
 from contextlib import contextmanager
 
 PATIENCE_S = 60.0
-"""Longest time of a call that moves nothing, in s: some packages load for a long time."""
+"""Timeout of calls that move nothing, in s; some packages take long to load."""
 
 
 @contextmanager
 def alarm(call: Callable[[], None], every_s: float) -> Iterator[None]:
-    """Call a function every so many seconds, between two steps of Python; it may raise there.
+    """Call a function periodically between two Python instructions; it may raise.
 
-    Only in the main thread, and only on systems with timers; otherwise it is never called.
+    It is called only in the main thread, and only on systems with timers.
     """
     timers = hasattr(signal, "setitimer")
     if not timers or threading.current_thread() is not threading.main_thread():
@@ -30,7 +30,7 @@ def alarm(call: Callable[[], None], every_s: float) -> Iterator[None]:
 
 @contextmanager
 def time_limit() -> Iterator[None]:
-    """Raise TimeoutError after :data:`PATIENCE_S`, where :func:`alarm` works."""
+    """Raise TimeoutError after :data:`PATIENCE_S` if :func:`alarm` works here."""
 
     def expired() -> None:
         raise TimeoutError(f"it has not returned within {PATIENCE_S:g} s")

@@ -31,7 +31,7 @@ CalibrationDate: TypeAlias = Annotated[date, BeforeValidator(_date)]
 
 
 class CalibrationOrigin(StrictModel):
-    """Origin of a calibration, and what it leaves.
+    """Origin of a calibration, and its residuals.
 
     Attributes:
         by: Operator.
@@ -65,7 +65,7 @@ class CalibrationOrigin(StrictModel):
 
 
 class SensorCalibration(CalibrationOrigin):
-    """True displacement by the sensor's reading, both in um.
+    """True displacement as a function of the sensor's reading, both in um.
 
     Attributes:
         range_um: Lowest and highest calibrated reading.
@@ -120,7 +120,7 @@ class SensorCalibration(CalibrationOrigin):
     def curve(self, low_um: float, high_um: float) -> tuple[F64, F64]:
         """Return the points of the curve for a sensor that reads from ``low_um`` to ``high_um``.
 
-        Raise InputError if the sensor reads nothing in the calibrated range.
+        Raise InputError if this range and the calibrated one do not overlap.
         """
         low, high = max(low_um, self.range_um[0]), min(high_um, self.range_um[1])
         if not low < high:
@@ -135,7 +135,7 @@ class SensorCalibration(CalibrationOrigin):
 class AmplifierCalibration(CalibrationOrigin):
     """The actual command is ``gain * command + offset``.
 
-    A line far from the identity is a wrong read-back, which would drive the actuator too far.
+    A line far from the identity means a wrong read-back, which would drive the actuator too far.
 
     Attributes:
         range: Lowest and highest command of the calibration.

@@ -39,7 +39,7 @@ class VoltageLimit(DeviceOptions):
         return self.voltage_max_v / self.resistance_ohm
 
     def decay(self, seconds: float) -> float:
-        """Return the remaining part of a current that nothing drives."""
+        """Return the remaining fraction of an undriven current."""
         return math.exp(-self.resistance_ohm / self.inductance_h * seconds)
 
     def voltage_v(self, current_a: F64, period_s: float) -> F64:
@@ -56,9 +56,9 @@ _TAKEN = {"sample", "t_s", "flags", *(each.name for each in RECORDED_FIELDS)}
 
 
 def limited_range(limits: object) -> tuple[float, float] | None:
-    """Return the range of the drive, A or V, in an experiment's section of limits, not validated.
+    """Return the range of the drive, A or V, from a ``limits`` section that is not validated yet.
 
-    None if it sets none, or no valid one.
+    None if the range is missing or invalid.
     """
     match limits:
         case {"peak_current_a": int() | float() as high} if high > 0.0:
@@ -86,7 +86,7 @@ class AuxChannel:
 
     def __post_init__(self) -> None:
         if not self.name.isidentifier() or self.name in _TAKEN:
-            rule = "must be a word of letters, digits and '_', and no column of a recording"
+            rule = "must consist of letters, digits and '_', and not be a column of recordings"
             raise InputError(f"aux.{self.name}: the name {rule}")
 
 
@@ -118,27 +118,28 @@ class DeviceInfo:
         holds: Resources that it uses exclusively while open, with a name common to all devices
             (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``). Empty for a device without such a
             resource.
-        identity: Names of the device with the output, by which its last run is found again: those
-            in ``holds``, the steadiest first, and the serial number of its USB adapter, beginning
-            with ``usb:``, which alone counts between two devices that have one. Empty: ``holds``.
+        identity: Names that identify the device with the output, to find its last run: those in
+            ``holds``, the most stable first, and the serial number of its USB adapter, prefixed by
+            ``usb:``. If two devices have a serial number, only these are compared. Empty:
+            ``holds``.
         output: Name of the output among those of the device; empty if there is one.
         simulated: Whether it drives no hardware and steps on sample count, so that it may run
             faster than real time.
         watchdog_command: Output set by the device's watchdog when the host is silent, in
             ``command_unit``; None without a watchdog.
-        watchdog_timeout_s: Silence after which it does; None without a watchdog.
-        arm_s: Longest duration of :meth:`WatchdogDevice.arm` on the line; 0 without a watchdog.
+        watchdog_timeout_s: Silence after which the watchdog trips; None without one.
+        arm_s: Longest communication time of :meth:`WatchdogDevice.arm`; 0 without a watchdog.
         watchdog_reason: Reason for a watchdog value other than the safe value; may be empty.
         safe_note: Limitation of the safe value in words: its message takes longer than 0.2 s, or
             the device cannot confirm it; may be empty.
-        confirms: Whether an answer of the device is evidence of the command that it answers.
+        confirms: Whether an answer of the device confirms the command that it answers.
         details: Facts for the recording (serial numbers, physical parameters). Opening may add some
             (``transactions``: requests per tick).
         files: YAML texts for the recording by file name, such as ``profile.yaml``.
-        calibration: Calibration of sensor and amplifier. With one of the sensor, the device has the
-            last exchange's readings before their correction as ``reading_um``.
-        aux: Auxiliary channels. With any, the device has their newest values after an exchange as
-            ``aux``, float64[len(aux)]; NaN is a missing value.
+        calibration: Calibration of sensor and amplifier. With a calibrated sensor, ``reading_um``
+            of the device holds the uncorrected readings of the last exchange.
+        aux: Auxiliary channels. If there are any, ``aux`` of the device holds their newest values
+            after an exchange: float64[len(aux)], NaN if missing.
         digital_output: Name of the digital output for triggers; empty without one. With a digital
             output or input the device is a :class:`DigitalDevice`.
         digital_output_s: Time to set it, in s; part of ``max_rate_hz``.
@@ -314,7 +315,7 @@ class WatchdogDevice(Protocol):
     """A device with a watchdog."""
 
     def arm(self) -> None:
-        """Arm the device's watchdog, if the experiment wants it.
+        """Arm the device's watchdog, if the experiment enables it.
 
         Called once after the start signal, immediately before the first exchange, because the run
         may wait to start after :meth:`Device.open`. Must not move the output.
@@ -353,8 +354,8 @@ class PortDevice(Protocol):
     """A device on a port whose path may lead to another device later.
 
     Attributes:
-        port_identity: The device that the path led to at first; empty if there was none. A process
-            that is started later sets it, and writes nothing to another one.
+        port_identity: The device that the path led to first; empty if there was none. A process
+            that starts later sets it, and then refuses to write to any other device.
     """
 
     port_identity: str

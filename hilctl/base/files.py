@@ -17,7 +17,8 @@ from hilctl.base.formatting import did_you_mean
 class TextFiles:
     """Text files that are read from disk once.
 
-    The loop process gets the texts that the check has read, so that a run uses what was checked.
+    The loop process receives the texts that the check has read, so that a run uses the checked
+    ones.
 
     Attributes:
         texts: The text of each file read so far, by its absolute path.
@@ -198,11 +199,11 @@ def begins_as_recording(path: Path) -> bool:
 def _written(path: Path, *, overwrite: bool) -> Iterator[AtomicFile]:
     try:
         if overwrite and path.is_file() and path.stat().st_size and begins_as_recording(path):
-            raise InputError(f"{path}: is a recording, which is never replaced: give another name")
+            raise InputError(f"{path}: is a recording, which is never replaced: use another name")
         with AtomicFile(path, overwrite=overwrite) as file:
             yield file
     except FileExistsError:
-        raise already_there(path, "give another name, or --overwrite") from None
+        raise already_there(path, "use another name, or --overwrite") from None
     except FileNotFoundError as error:
         lost = "" if path.parent.is_dir() else f" (there is no folder {path.parent})"
         raise InputError(f"{path}: cannot be written: {error.strerror}{lost}") from None
@@ -241,7 +242,7 @@ def check_no_input(path: Path, inputs: Iterable[Path]) -> None:
     for each in inputs:
         with suppress(OSError):  # a missing file is not an input
             if path.samefile(each):
-                raise InputError(f"{path}: is read by the same command: give another name")
+                raise InputError(f"{path}: is an input of the same command: use another name")
 
 
 REMEDIES = {

@@ -107,7 +107,7 @@ def did_you_mean(word: str, known: Iterable[str], *, listed: bool = False) -> st
 
 
 def _is_plausible(word: str, name: str) -> bool:
-    """Return whether a name has the same letters, or one begins or consists of parts of both."""
+    """Return whether two names have equal letters, or one begins or contains the other."""
     short, long = sorted((word.lower(), name.lower()), key=len)
     inside = f"_{short}_" in f"_{long}_" or long.startswith(short)
     return (inside and len(short) > 2) or sorted(short) == sorted(long)

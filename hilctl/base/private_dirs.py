@@ -1,4 +1,4 @@
-"""Folders of one user that are safe from links and writes of other users, and file locks.
+"""Private folders, safe from links and writes of other users; file locks.
 
 In a shared folder such as /dev/shm another user may create a link or a folder under any name first.
 Locks on open files end with the process that holds them.
@@ -47,7 +47,7 @@ def private_folder(path: Path, *, make: bool = True) -> Path:
     if make:
         with suppress(FileExistsError):
             path.mkdir(mode=0o700)
-    if not hasattr(os, "geteuid"):  # Windows: what stands in one's own folder is one's own
+    if not hasattr(os, "geteuid"):  # Windows: the user's own folder is private
         if not path.is_dir():
             raise FileNotFoundError(errno.ENOENT, os.strerror(errno.ENOENT), str(path))
         return path

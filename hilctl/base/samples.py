@@ -13,9 +13,9 @@ import numpy.typing as npt
 from hilctl.base.types import F64, I64, U32, CommandUnit
 
 LAST_SAMPLE = 2**40
-"""Above every sample index: a hundred million samples and a safe ramp of an hour at 1 MHz."""
+"""Upper bound of sample indices: a hundred million, and a safe ramp of an hour at 1 MHz."""
 LONGEST_NS = 2**60
-"""Above every time of a tick since the start of the machine."""
+"""Upper bound of the times of ticks since the computer started."""
 
 WhenRecorded: TypeAlias = Literal["always", "measured", "own_input", "aged", "corrected"]
 """``measured``: if the device measures its command; ``own_input``: if the compensator's input
@@ -88,7 +88,7 @@ class Samples:
     reference_um: Annotated[
         F64,
         SampleColumn(
-            "wanted displacement; NaN where there is none (current runs, ramp)",
+            "requested displacement; NaN without one (current runs, ramp)",
             RecordedField("reference_um", "um", block=5, before=6, scope=3),
             in_waveform_unit=True,
         ),
@@ -104,7 +104,7 @@ class Samples:
     command: Annotated[
         F64,
         SampleColumn(
-            "command that was put out",
+            "applied command",
             RecordedField("current_a", "A", block=7, before=8, scope=5),
             RecordedField("drive_v", "V", block=12, before=12, scope=9),
         ),
@@ -112,7 +112,7 @@ class Samples:
     displacement_um: Annotated[
         F64,
         SampleColumn(
-            "displacement, sampled when the command was put out",
+            "displacement, sampled when the command was applied",
             RecordedField("displacement_um", "um", block=8, before=9, scope=6),
             answered=True,
         ),
@@ -130,7 +130,7 @@ class Samples:
     input_um: Annotated[
         F64,
         SampleColumn(
-            "the compensator's input: the reference ahead of its time, and what is added to it",
+            "the compensator's input: the advanced reference plus its corrections",
             RecordedField("input_um", "um", block=16, before=17),
             when="own_input",
             otherwise="reference_um",
@@ -174,7 +174,7 @@ class Samples:
         return {name: getattr(self, name) for name in COLUMNS}
 
     def rows(self, chosen: slice | npt.NDArray[np.bool_] | I64) -> Self:
-        """Return some rows of all that is there."""
+        """Return some rows of every column."""
         columns = {
             name: values[chosen] if values.size else values
             for name, values in self.columns().items()
@@ -188,7 +188,7 @@ class Samples:
         return self.rows(slice(int(low), int(high)))
 
     def followed_by(self, later: "Samples") -> "Samples":
-        """Return these rows and others after them."""
+        """Return these rows followed by others."""
         names = [each.name for each in fields(self)]
         return Samples(
             **{name: np.concatenate((getattr(self, name), getattr(later, name))) for name in names}
@@ -244,7 +244,7 @@ class BlockBatch:
 
     @classmethod
     def empty(cls, blocks: int, block: int, state_size: int, aux: int = 0) -> "BlockBatch":
-        """Return room for blocks, in this process's own memory."""
+        """Return an empty batch in the memory of this process."""
         return cls(
             np.zeros((blocks, len(BlockHeader)), dtype=np.int64),
             np.zeros((blocks, state_size)),
@@ -272,7 +272,7 @@ class BlockBatch:
         return replace(samples, aux=self.aux[blocks].repeat(self.flags.shape[1], axis=0))
 
     def clear_answers(self, blocks: slice | I64) -> None:
-        """Set all that the device fills to NaN."""
+        """Set all rows that the device fills to NaN."""
         for row in ANSWERS:
             self.columns[blocks, row] = np.nan
         self.aux[blocks] = np.nan
@@ -304,7 +304,7 @@ class Flag(IntFlag):
     UNANSWERED = 32
     """The device did not answer the exchange: the command may not have reached it."""
     CONDITION = 1 << 17
-    """Of the conditioning before the waveform, which has no reference: its cycle, and the rest."""
+    """A sample of the conditioning before the waveform (cycle or rest), without a reference."""
     AFTER_SKIPPED = 1 << 16
     """In the first block after skipped ticks, in which the output was constant."""
     INVERSE_OUT = 1 << 18

@@ -1,4 +1,4 @@
-"""Base of all pydantic models, the pydantic names that models use, and the words of its errors."""
+"""Base of all pydantic models, the pydantic names that models use, and the texts of its errors."""
 
 import re
 from collections.abc import Iterable, Mapping
@@ -53,7 +53,7 @@ _RULES = {
     "value_error": "{error}",
 }
 WORDS = {"literal_error", "union_tag_invalid"}
-"""Types of error of a value that is none of several words."""
+"""Error types of values outside a list of words."""
 
 
 def rule_of(detail: ErrorDetails) -> str:
@@ -74,8 +74,8 @@ def expected(detail: ErrorDetails) -> str:
     return str(context.get("expected") or context.get("expected_tags"))
 
 
-HALF_CHARACTER = "holds half a character (an escape from \\ud800 to \\udfff)"
-"""Rule that a text breaks which no file can hold."""
+HALF_CHARACTER = "contains half a character (an escape from \\ud800 to \\udfff)"
+"""Rule for texts that UTF-8 cannot encode."""
 _ESCAPES = re.compile(
     r"\\u[dD][89abAB]\w\w\\u[dD][c-fC-F]\w\w|(\\u[dD][89a-fA-F]\w\w)|\\.", re.DOTALL
 )
@@ -84,7 +84,7 @@ _ESCAPES = re.compile(
 def without_halves(json_text: str) -> str:
     """Return a JSON text with U+FFFD for each escape of half a character.
 
-    Browsers cut a text at its length in halves of characters, and JSON is read without them only.
+    Browsers may cut a text within a character, and the JSON parser rejects half characters.
     """
     return _ESCAPES.sub(lambda escape: "\\ufffd" if escape[1] else escape[0], json_text)
 
@@ -99,7 +99,7 @@ class StrictModel(BaseModel):
     """A frozen model that rejects unknown keys, other types, NaN and infinity."""
 
     REMOVED: ClassVar[Mapping[str, str]] = {}
-    """Keys of earlier releases, each with what to do."""
+    """Keys of earlier releases, each with its remedy."""
 
     model_config = ConfigDict(frozen=True, strict=True, extra="forbid", allow_inf_nan=False)
 

@@ -19,7 +19,7 @@ def python_command(*words: str) -> list[str]:
 
 @contextmanager
 def safe_import_path() -> Iterator[None]:
-    """Let Python processes that are started meanwhile import nothing from the working folder."""
+    """Keep Python processes that are started meanwhile from importing from the working folder."""
     before = os.environ.get(_SAFE_PATH)
     os.environ[_SAFE_PATH] = "1"
     try:

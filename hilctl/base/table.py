@@ -8,8 +8,7 @@ Encoding, separator, decimal mark, preamble, names and units of a text table are
 - The data begin with the first row that has a number in each numeric column. The row above it holds
   the names, or only units below the names. Otherwise names may be in a comment (``#`` or ``%``) of
   as many cells, as ``numpy.savetxt`` writes them. What is above is a preamble and is skipped.
-- The data end before a footer and a row that is not completely written, which are skipped with a
-  warning.
+- The data end before a footer or an incomplete last row, which is skipped with a warning.
 """
 
 import csv
@@ -126,13 +125,13 @@ class TableRows:
     def _time_step(self, time_s: F64, steps: F64) -> tuple[float, float]:
         """Return the median step and the span, in s, of times that rise."""
         if not steps.size:
-            raise DataError(f"{self.path}: holds one row of numbers: needs at least two")
+            raise DataError(f"{self.path}: must have at least two rows of numbers, got one")
         step, span_s = float(np.median(steps)), float(time_s[-1] - time_s[0])
         if span_s > 0.0 and steps.min() == 0.0:
             row = int(np.argmin(steps))
             raise DataError(
                 f"{self.path}:{self.lines[row + 1]}: time repeats: the column has too few digits "
-                "or a row is there twice; set the sample rate (rate_hz) instead, about "
+                "or a row is duplicated; set the sample rate (rate_hz) instead, about "
                 f"{steps.size / span_s:.4g}"
             )
         if not step > 0.0:
@@ -155,7 +154,7 @@ class Table(ABC):
         self._units = list(units) or [_unit_in(name) for name in names]
 
     def index(self, column: Column | None) -> int:
-        """Return the index from 0 of a column; None is the only one.
+        """Return the index from 0 of a column; None selects the only one.
 
         A name may omit a unit in brackets. Raise DataError if it names no or several columns.
         """
@@ -256,7 +255,7 @@ def check_rows(path: Path, count: int, first_row: int, last_row: int | None) -> 
     """Raise DataError unless all rows, counted from 1, exist; ``last_row`` None is the last."""
     if not 1 <= first_row <= (count if last_row is None else last_row) <= count:
         last = "the last" if last_row is None else last_row
-        raise DataError(f"{path}: has {count} rows: rows {first_row} to {last} are not all there")
+        raise DataError(f"{path}: has {count} rows: rows {first_row} to {last} are out of range")
 
 
 def _unit_in(name: str) -> str:
@@ -294,14 +293,14 @@ class TextTable(Table):
         self.path = path
         self._separator, self._comma, self._trailing, numeric = _form(sample)
         if not any(numeric):
-            raise DataError(f"{path}: holds no rows of numbers")
+            raise DataError(f"{path}: contains no rows of numbers")
         if len(numeric) > MAX_COLUMNS:
             raise DataError(f"{path}: must have at most {MAX_COLUMNS} columns, got {len(numeric)}")
         self._count = len(numeric)
         chosen = [column for column, is_numeric in enumerate(numeric) if is_numeric]
         data = (at for at, (_, line) in enumerate(rows) if self._is_data(self.cells(line), chosen))
         if (first := next(data, None)) is None:
-            raise DataError(f"{path}: holds no row with a number in each column of numbers")
+            raise DataError(f"{path}: contains no row with a number in each numeric column")
         last = len(rows) - (text[-1] not in "\r\n" and _is_cut(sample))
         while last > first + 1 and self._is_footer(self.cells(rows[last - 1][1]), chosen):
             last -= 1
@@ -430,7 +429,7 @@ def _decoded(path: Path, raw: bytes) -> str:
             continue
         if "\0" not in text:
             return text
-    raise DataError(f"{path}: is not a text table, nor of another known kind of file")
+    raise DataError(f"{path}: is neither a text table nor a file of another known kind")
 
 
 def _form(sample: list[str]) -> tuple[str, bool, bool, list[bool]]:
@@ -522,7 +521,7 @@ def open_table(path: Path, skip_rows: int = 0) -> Table:
     most = max((each.size for each in columns.values()), default=0)
     columns = {name: each for name, each in columns.items() if each.size == most}
     if most == 0:
-        raise InputError(f"{path}: holds no array of numbers")
+        raise InputError(f"{path}: contains no array of numbers")
     if len(columns) > MAX_COLUMNS:
         raise InputError(f"{path}: holds {len(columns)} columns, at most {MAX_COLUMNS} are read")
     return ArrayTable(path, columns)

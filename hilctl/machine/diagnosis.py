@@ -1,8 +1,8 @@
 """Diagnosis of this computer: checks, and measured timer latency.
 
-A check of a :class:`~hilctl.machine.procfs.Machine` returns what it found and a remedy, which is
-empty if there is nothing to do. What the loop's own set-up shows (priority, locked memory, idle
-states, the CPU) is no check: the measurement includes its steps, and a recording has them too.
+A check of a :class:`~hilctl.machine.procfs.Machine` returns its finding and a remedy, which is
+empty if there is nothing to do. The loop's own set-up (priority, locked memory, idle states, CPU)
+is not checked: the measurement includes its steps, and so does each recording.
 """
 
 import os
@@ -67,7 +67,7 @@ def isolated_cpus(machine: Machine) -> _Found:
     text = ", ".join(map(str, isolated))
     if set(isolated) <= set(cpu_numbers(ticks)):
         return f"{text}, without scheduler ticks", ""
-    return f"{text}; nohz_full would spare it the scheduler's ticks", ""
+    return f"{text}; nohz_full would avoid the scheduler's ticks", ""
 
 
 def governor(machine: Machine) -> _Found:
@@ -126,7 +126,7 @@ def serial_ports(machine: Machine) -> _Found:
         group = machine.path(closed[0]).group()
     except (KeyError, OSError):
         group = "dialout"
-    remedy = f"sudo usermod --append --groups {group} $USER, and log in anew"
+    remedy = f"sudo usermod --append --groups {group} $USER, and log in again"
     return f"no permission for {', '.join(closed)}", remedy
 
 

@@ -1,4 +1,4 @@
-"""A thread and descriptors, held for the safe value: it must be written when there are no more."""
+"""A reserve of a thread and descriptors, to write the safe value when no more are available."""
 
 import os
 import sys
@@ -17,7 +17,7 @@ _DESCRIPTORS = 8
 
 
 class Reserve:
-    """What a process holds until it lacks it: one per process, see :data:`RESERVE`."""
+    """The thread and descriptors that a process reserves; one per process, see :data:`RESERVE`."""
 
     def __init__(self) -> None:
         self.thread: Thread | None = None
@@ -27,7 +27,7 @@ class Reserve:
         self._idle = Semaphore(0)
 
     def hold(self) -> None:
-        """Take the reserve, unless it was taken; raise OSError or RuntimeError if that fails."""
+        """Acquire the reserve, unless that was done; raise OSError or RuntimeError if it fails."""
         if self.thread is not None:
             return
         self._descriptors = [os.open(os.devnull, os.O_RDONLY) for _ in range(_DESCRIPTORS)]
@@ -49,10 +49,10 @@ class Reserve:
         return ended
 
     def release(self) -> bool:
-        """Free descriptors, standard input too; return False if that was done, or none was held.
+        """Free the descriptors and standard input; return False if none are held.
 
-        A limit below the numbers in use refuses all numbers from there on, whatever was closed. So
-        it is raised as far as allowed, and standard input frees number 0, below any limit.
+        If the limit of descriptors is below the numbers in use, closing those above it frees none.
+        So the limit is raised as far as allowed, and closing standard input frees number 0.
         """
         if not self._descriptors:
             return False

@@ -24,12 +24,12 @@ ISOLATED = "/sys/devices/system/cpu/isolated"
 
 PRIORITY_REMEDY = (
     f"put '@realtime - rtprio 98' and '@realtime - nice -10' into {LIMITS_FILE}, join that group, "
-    "log in anew"
+    "log in again"
 )
 """What to do if SCHED_FIFO or a higher priority of the supervisor is refused."""
 GROUP_REMEDY = "write 950000 to its cpu.rt_runtime_us, or boot with rt_group_sched=0"
 MEMORY_REMEDY = (
-    f"put '@realtime - memlock unlimited' into {LIMITS_FILE}, join that group, log in anew"
+    f"put '@realtime - memlock unlimited' into {LIMITS_FILE}, join that group, log in again"
 )
 DMA_REMEDY = 'a udev rule: KERNEL=="cpu_dma_latency", GROUP="realtime", MODE="0660"'
 
@@ -102,7 +102,7 @@ def _pin(settings: Realtime, system: LinuxProcess) -> SetUpStep:
             cpu = min(cpu_numbers(system.read(ISOLATED)), default=None)
         if cpu is None:
             return SetUpStep("cpu", "not asked", "no CPU is isolated: any may be used")
-    remedy = "name a CPU of this machine that this process may use under realtime.cpu"
+    remedy = "set realtime.cpu to a CPU that this process may use"
     return _step("cpu", f"CPU {cpu}", lambda: system.pin(cpu), remedy)
 
 
@@ -120,7 +120,7 @@ def _set_fifo(settings: Realtime, system: LinuxProcess) -> SetUpStep:
 
 
 def _throttling(system: LinuxProcess) -> str:
-    """Describe the CPU share of real-time tasks; empty if the kernel does not tell."""
+    """Describe the CPU share of real-time tasks; empty if unknown."""
     with suppress(OSError, ValueError):
         runtime_us = int(system.read(RT_RUNTIME))
         period_us = int(system.read(RT_PERIOD))

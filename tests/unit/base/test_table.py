@@ -51,7 +51,7 @@ def test_unnamed_columns_have_numbers(tmp_path: Path) -> None:
     ([0, 1, 2, 3, -9], 0.5, "t.csv:5: samples must be evenly spaced in time: this one is -12 s"),
     ([0, 1, 2.02, 3, 4], 0.01, "t.csv:3: samples must be evenly spaced in time: this one is 1.02"),
     ([4, 3, 2, 1, 0], 0.5, "t.csv: time must rise"),
-    ([7], 0.5, "t.csv: holds one row of numbers"),
+    ([7], 0.5, "t.csv: must have at least two rows"),
     ([*np.arange(50), *(50 + 1.2 * np.arange(50))], 0.5, "t.csv:"),
 ])  # fmt: skip
 def test_uneven_time(times: list[float], tolerance: float, message: str) -> None:
@@ -180,7 +180,7 @@ def test_errors_have_their_line(table, text: str, message: str) -> None:
 @pytest.mark.parametrize("text", ["", " \n\t\n", "# a,b\n", "a,b\n"])
 def test_nothing(table, text: str) -> None:
     """Neither header nor rows."""
-    assert refusal(table, text).startswith("t.csv: holds no rows")
+    assert refusal(table, text).startswith("t.csv: contains no rows")
 
 
 def test_columns_that_are_not_read_may_contain_text(table) -> None:
@@ -200,7 +200,7 @@ def test_rows(table, other: str, first: int, last: int | None, found: list[int] 
     """Rows count from 1; missing ones are refused."""
     made = table("".join(f"{k},{other}\n" for k in range(4)))
     if isinstance(found, str):
-        text = f"t.csv: has 4 rows: rows {found} are not all there"
+        text = f"t.csv: has 4 rows: rows {found} are out of range"
         assert refusal(made.read, [0], first, last) == text
     else:
         assert made.read([0], first, last).values.tolist() == [found]
@@ -336,7 +336,7 @@ def test_a_whole_last_row_is_kept(table, end):
 
 
 def test_columns_without_a_row_that_has_them_all_are_refused(table):
-    assert refusal(table, "1,a\nb,2\n").startswith("t.csv: holds no row")
+    assert refusal(table, "1,a\nb,2\n").startswith("t.csv: contains no row")
 
 
 def test_utf_16_cut_within_a_character_is_read(table):

@@ -208,7 +208,7 @@ def test_duplicate_keys_are_all_named():
     pytest.param("a: " + 9_000 * "{b: ",
                  "bench.yaml:1: is not readable YAML (nested more than 32 deep)", id="9000 deep"),
     ("a: " + 40 * "[", "bench.yaml:1: is not readable YAML (nested more than 32 deep)"),
-    ('a: "\\ud800"\n', "bench.yaml:1: is not readable YAML (holds half a character"),
+    ('a: "\\ud800"\n', "bench.yaml:1: is not readable YAML (contains half a character"),
     ('a: "\\U99999999"\n', "bench.yaml:1: is not readable YAML (an escape names"),
     ('a: 1\nb: "\\U7fffffff"\n', "bench.yaml:2: is not readable YAML (an escape names"),
     ("a: 1\nb: 2\nc: \x07\n", "bench.yaml:3: is not readable YAML (the character U+0007 is not"),
