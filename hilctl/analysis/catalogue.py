@@ -1,4 +1,4 @@
-"""Catalogue of the recordings in a folder: facts from both ends of each file, queries in SQLite."""
+"""Catalogue of the recordings in a folder: metadata from both ends of each file, SQLite queries."""
 
 import json
 import logging
@@ -52,10 +52,10 @@ COLUMNS: dict[str, type] = {
 }
 """Names and types of the columns.
 
-``path`` is relative to the folder that was listed, ``state`` that of
-:class:`hilctl.recording.run_summary.RunSummary`, or ``unreadable``, ``waveform`` its text,
-``frequency_hz`` the highest of all segments that repeat. All other names, except ``options``, are
-those of facts in a recording.
+``path`` is relative to the listed folder. ``state`` is the state of a
+:class:`hilctl.recording.run_summary.RunSummary`, or ``unreadable``. ``waveform`` is a text,
+``frequency_hz`` the highest frequency of all periodic segments. All other names, except
+``options``, are names of metadata in a recording.
 """
 
 _BOOLEANS = {"true": True, "false": False, "True": True, "False": False}
@@ -90,9 +90,9 @@ def select(
 ) -> list[Entry]:
     """Return the recordings that match a condition, sorted; those without the sort key are last.
 
-    The condition is in the SQL of SQLite on the names of :func:`keys_of`; empty for all. A text may
-    be in double quotes. A key with other characters is in square brackets, such as ``[label.batch
-    no]``. Raise InputError if the condition is not valid, or a key is unknown.
+    The condition is an SQLite expression on the names of :func:`keys_of`; an empty one selects all.
+    A text may be in double quotes. A key with other characters needs square brackets, such as
+    ``[label.batch no]``. Raise InputError if the condition is not valid, or a key is unknown.
     """
     names: set[str] = set()
     condition, key = (_TOKEN.sub(partial(_as_sql, names), text) for text in (where, sort))
@@ -205,7 +205,7 @@ def unreadable(path: str, size_bytes: int, mtime_ns: int, problem: str) -> Entry
 
 
 def entry_of(file: Path, path: str, size_bytes: int, mtime_ns: int) -> Entry:
-    """Return the entry of a file by both its ends; ``path`` is its name in the catalogue."""
+    """Return the entry of a file, from its start and end; ``path`` is its name in the catalogue."""
     entry = unreadable(path, size_bytes, mtime_ns, "")
     try:
         ends = read_ends(file)
@@ -259,7 +259,7 @@ def _plain(text: str) -> str | float | bool:
     if text in _BOOLEANS:
         return _BOOLEANS[text]
     try:
-        value = json.loads(text)  # not float(): a serial number keeps the zeros before it
+        value = json.loads(text)  # not float(): a serial number keeps its leading zeros
     except (ValueError, RecursionError):
         return text
     number = isinstance(value, int | float) and abs(value) < math.inf

@@ -4,12 +4,12 @@ The error of a sample is the distance of its measured point from the nearest poi
 path, which joins the references by straight lines. A lag along the path is no contour error; it is
 the along-path error, from the sample's reference to the nearest point.
 
-The nearest point is searched on the stretch of the path around the sample's reference: before and
-after it by twice the distance of the measured point from that reference. The way along the path is
-at most 1.1 times that distance for a lag of 90 degrees on a circle, and 1.4 times around a right
-angle. Another branch of the path that passes nearby is farther away along the path: two branches of
-a Lissajous figure that cross, and two turns of a spiral, are a period of the fastest axis apart or
-more, and the flyback of a raster is as far away as the end of the line.
+The search covers the path before and after the sample's reference, each up to twice the distance of
+the measured point from that reference. The nearest point is at most 1.1 times that distance away
+along the path for a lag of 90 degrees on a circle, and 1.4 times around a right angle. Other
+branches that pass nearby are farther away along the path: crossing branches of a Lissajous figure
+and adjacent turns of a spiral are at least a period of the fastest axis apart, and the flyback of a
+raster is as far away as the end of the line.
 """
 
 import json
@@ -53,7 +53,8 @@ class ContourMetrics:
         peak_um: Largest contour error.
         along_mean_um: Mean along-path error; negative if the axes lag.
         lag_s: Mean lag: the mean along-path error over the mean speed of the reference.
-        limited_samples: Samples with :data:`MOST_REACH` of lag or lead, perhaps more.
+        limited_samples: Samples whose lag or lead is at the search limit :data:`MOST_REACH` or
+            beyond.
     """
 
     samples: int
@@ -171,8 +172,8 @@ class ContourTrace:
 def recordings_by_axis(paths: Sequence[Path]) -> dict[str, Path]:
     """Return the recordings of one run of several axes, the fast axis first; empty otherwise.
 
-    The others of a single recording are found by their facts in its folder. A missing one is logged
-    as a warning.
+    For a single recording, the others are found in its folder by their metadata. A missing one is
+    logged as a warning.
     """
     facts = {path: _facts(path) for path in paths}
     first = facts[paths[0]]
@@ -185,7 +186,7 @@ def recordings_by_axis(paths: Sequence[Path]) -> dict[str, Path]:
     found = {each[AXIS_FACT]: path for path, each in facts.items()
              if each.get("run_id") == run_id and each.get(AXIS_FACT) in names}  # fmt: skip
     if missing := [name for name in names if name not in found]:
-        _log.warning("%s: no recording of axis %s there", paths[0].parent, ", ".join(missing))
+        _log.warning("%s: no recording of axis %s in it", paths[0].parent, ", ".join(missing))
     return {name: found[name] for name in names if name in found} if len(found) > 1 else {}
 
 
@@ -209,7 +210,8 @@ def contour(
 ) -> tuple[ContourReport, tuple[ContourTrace | None, ...]]:
     """Return the contour errors of a run, and the last samples of each segment, None without any.
 
-    If the waveforms of all axes repeat together, they are those of one such period.
+    If the waveforms of all axes have a common period, the last samples are those of one such
+    period.
 
     ``runs`` are the recordings of its axes by name, as repeatable iterables of pieces, which are
     read two or three times, in bounded memory. Raise DataError as
@@ -222,18 +224,18 @@ def contour(
         given = ", ".join(f"{name}: {each.sample_rate_hz:g} Hz" for name, each in reports.items())
         raise DataError(f"the axes of a run must have one sample rate: {given}")
     rate_hz = rates_hz.pop()
-    stretches = reduce(
+    shared = reduce(
         _overlaps,
         (
             [
-                _Stretch((segment.label,), start, stop, (segment.period,))
+                _SharedSegment((segment.label,), start, stop, (segment.period,))
                 for segment, (start, stop, _) in each.windows
             ]
             for each in builders.values()
         ),
     )
     total, skew = _Errors(rate_hz), _Skew([*runs][1:])
-    parts = [_Part(each, rate_hz, total, _TRACED // len(stretches)) for each in stretches]
+    parts = [_Part(each, rate_hz, total, _TRACED // len(shared)) for each in shared]
     for found in _evaluated(_common([*runs.values()], skew)):
         for part in parts:
             part.add(found)
@@ -245,7 +247,7 @@ def contour(
 
 
 @dataclass(frozen=True, slots=True)
-class _Stretch:
+class _SharedSegment:
     """Evaluated samples of one segment of each axis, and the periods of its waveforms."""
 
     labels: tuple[str, ...]
@@ -253,8 +255,8 @@ class _Stretch:
     stop: int
     periods: tuple[float, ...]
 
-    def overlap(self, other: "_Stretch") -> "_Stretch":
-        return _Stretch(
+    def overlap(self, other: "_SharedSegment") -> "_SharedSegment":
+        return _SharedSegment(
             self.labels + other.labels,
             max(self.start, other.start),
             min(self.stop, other.stop),
@@ -273,7 +275,7 @@ class _Stretch:
         return whole
 
 
-def _overlaps(some: list[_Stretch], others: list[_Stretch]) -> list[_Stretch]:
+def _overlaps(some: list[_SharedSegment], others: list[_SharedSegment]) -> list[_SharedSegment]:
     found = (one.overlap(other) for one in some for other in others)
     return [each for each in found if each.start < each.stop]
 
@@ -299,7 +301,7 @@ def _evaluated(common: Iterable[Sequence[npt.NDArray[Any]]]) -> Iterator[Contour
 
 
 def _nearest(rows: Sequence[npt.NDArray[Any]], first: int, end: int) -> ContourTrace:
-    """Return some rows that are completely known."""
+    """Return the rows from ``first`` to ``end`` that all axes have measured."""
     index, path_um, points_um = rows
     at = np.arange(first, end)
     at = at[np.isfinite(points_um[at]).all(axis=1)]
@@ -350,22 +352,24 @@ class _Errors:
 
 
 class _Part:
-    """Contour errors of a stretch; they are also added to those of the run."""
+    """Contour errors of a segment; they are also added to those of the run."""
 
-    def __init__(self, stretch: _Stretch, rate_hz: float, total: _Errors, most_traced: int) -> None:
-        self._stretch, self._rate_hz, self._total = stretch, rate_hz, total
-        self._traced = min(stretch.traced(), max(most_traced, 2))
+    def __init__(
+        self, segment: _SharedSegment, rate_hz: float, total: _Errors, most_traced: int
+    ) -> None:
+        self._segment, self._rate_hz, self._total = segment, rate_hz, total
+        self._traced = min(segment.traced(), max(most_traced, 2))
         self._traces: deque[ContourTrace] = deque()
         self._errors = _Errors(rate_hz)
 
     def add(self, found: ContourTrace) -> None:
-        """Take the next samples, also those outside the stretch."""
-        mine = found.part(self._stretch.start, self._stretch.stop)
+        """Take the next samples; those outside the segment are ignored."""
+        mine = found.part(self._segment.start, self._segment.stop)
         if not mine.index.size:
             return
         for errors in (self._errors, self._total):
             errors.add(mine)
-        self._traces.append(mine.part(int(mine.index[-self._traced :][0]), self._stretch.stop))
+        self._traces.append(mine.part(int(mine.index[-self._traced :][0]), self._segment.stop))
         traced = sum(each.index.size for each in self._traces)
         while traced - self._traces[0].index.size >= self._traced:
             traced -= self._traces.popleft().index.size
@@ -373,8 +377,8 @@ class _Part:
     def segment(self) -> ContourSegment:
         return ContourSegment(
             **self._errors.metrics(),
-            labels=self._stretch.labels,
-            start_s=self._stretch.start / self._rate_hz,
+            labels=self._segment.labels,
+            start_s=self._segment.start / self._rate_hz,
         )
 
     def trace(self) -> ContourTrace | None:

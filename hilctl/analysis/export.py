@@ -1,6 +1,6 @@
 """Export of samples as tables: one recording, or all recordings of a folder as a data set.
 
-Numbers are kept bit for bit. CSV files have no place for the facts of the run.
+Numbers are kept bit for bit. CSV files cannot hold the metadata of the run.
 """
 
 import json
@@ -107,7 +107,7 @@ def write_pieces(
         for each in waiting:
             each.result()
     if not rows:
-        raise DataError(f"{piece.path}: holds no sample")
+        raise DataError(f"{piece.path}: contains no samples")
     file.finish(facts(piece))
     return rows
 

@@ -1,8 +1,8 @@
 """Replay: recompute the commands of a recording with the same code.
 
-With another model, the replay also predicts the error that its inverse would have left. Let u and y
-be the commands and displacements of the run, and M the model. The inverse gives commands u' with
-M(u') = reference. To first order in u' - u, their error is y - M(u), sensor noise included.
+With another model, the replay also predicts the residual error of its inverse. Let u and y be the
+commands and displacements of the run, and M the model. The inverse gives commands u' with M(u') =
+reference. To first order in u' - u, their error is y - M(u), sensor noise included.
 """
 
 import math
@@ -88,7 +88,8 @@ class ReplayResult:
     """Comparison of recomputed and recorded commands.
 
     Attributes:
-        left_out_samples: Samples after damage of the file, with unknown compensator memory.
+        left_out_samples: Samples after damage of the file, where the compensator's memory is
+            unknown.
         identical: Whether every wanted command, command and flag has the same bits.
         first_difference: Index of the first sample that differs, or None.
         largest_difference: Largest magnitude of a difference between commands.
@@ -136,7 +137,7 @@ def replay(
         running = running or _Running(piece, model, partial(_fades, pieces))
         running.add(piece)
     if running is None:
-        raise DataError("there is no recording to replay")
+        raise DataError("no recording to replay")
     return running.result()
 
 
@@ -156,7 +157,7 @@ class _Running:
         self._find_fades = find_fades
         self._fades: Sequence[Event] | None = None
         if model is not None and not first.compensated:
-            raise DataError(f"{first.path}: had no compensator: there is no reference to replay")
+            raise DataError(f"{first.path}: had no compensator, so it has no reference to replay")
         if model is not None and model.input_unit != first.command_unit:
             driven = f"{first.path}: was driven in {first.command_unit}"
             raise DataError(f"{driven}, the other model gives commands in {model.input_unit}")
@@ -180,7 +181,7 @@ class _Running:
         """Recompute the next piece."""
         samples = piece.samples
         if samples.index.size and not np.isfinite(samples.command).all():
-            # The limiter has no others.
+            # The limiter outputs finite commands only.
             raise DataError(f"{self._path}: /samples: every command must be finite")
         if self._fades is None and (_fades([piece]) or _out(samples).any()):
             self._fades = self._find_fades()
@@ -200,7 +201,7 @@ class _Running:
             self._go(self._waiting, self._waiting.index.size)
         found = self._comparison.result
         if not self._any_start or found.samples == 0:
-            raise DataError(f"{self._path}: holds no samples to replay")
+            raise DataError(f"{self._path}: contains no samples to replay")
         found.predicted = None if self._prediction is None else self._prediction.result()
         return found
 
@@ -296,7 +297,7 @@ class _Running:
             line = LinearBypass(values["slope"], values["at_zero"])
         waveform = (samples.flags & NO_WAVEFORM.value) == 0
         if not (_out(samples) == ((shares < 1.0) & waveform)).all():
-            raise DataError(f"{self._path}: /events: when the inverse went out or in is not there")
+            raise DataError(f"{self._path}: /events: a change of the inverse is missing")
         return shares, line
 
     def _inputs(self, samples: Samples, part: slice, end: int) -> F64:

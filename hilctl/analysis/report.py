@@ -65,7 +65,7 @@ def build_report(
             if add:
                 add(piece)
         if builder is None:
-            raise DataError("there is no recording to judge")
+            raise DataError("no recording to evaluate")
         right = builder.right_windows()
         if windows is not None or right == builder.windows:
             return builder
@@ -213,7 +213,7 @@ class _Extremes:
 
 
 def _identity(recording: Recording) -> dict[str, Any]:
-    cut_short = "the recording is cut short: its end was not recorded"
+    cut_short = "the recording is truncated: its end is missing"
     return {
         "path": str(recording.path),
         "name": recording.run.get("name", ""),

@@ -1,6 +1,6 @@
 """Metrics of a run and of each of its segments, and their rows of text.
 
-A metric without meaning is None: an average without a period, an error without a reference.
+A metric that does not apply is None: an average without a period, an error without a reference.
 """
 
 from collections.abc import Mapping
@@ -18,8 +18,8 @@ from hilctl.recording.metadata_keys import LabelValue
 class RunMetrics:
     """Metrics of the average cycle, except the raw ones.
 
-    The loop is displacement against reference_um with a compensator, otherwise displacement against
-    the command, without errors.
+    The loop is displacement over reference_um with a compensator, otherwise displacement over the
+    command, without errors.
 
     Attributes:
         peak_hysteresis_percent: Largest output difference of a rising and a falling branch at one
@@ -28,9 +28,9 @@ class RunMetrics:
         loop_area: Area enclosed by the loop, in um times the input's unit.
         peak_error_percent: Largest displacement less reference, offset included, over the
             peak-to-peak reference; the raw error without a period.
-        rms_error_percent: Its root mean square.
+        rms_error_percent: Root mean square of the same difference, over the same.
         peak_error_raw_percent: Peak error of all steady samples without averaging.
-        rms_error_raw_percent: Its root mean square.
+        rms_error_raw_percent: Their root mean square error.
         sensor_noise_um: Estimated rms noise of a single displacement sample.
         steady_cycles: Evaluated whole cycles.
         steady_samples: Evaluated samples.
@@ -84,9 +84,9 @@ class AuxReport:
 class RunReport(RunMetrics):
     """Metrics of a run.
 
-    Each metric is the largest of all segments. The noise floor is that of the segment with the
-    largest peak hysteresis, and the sensor noise that of all steady samples. Cycles and steady
-    samples are summed; extremes include all recorded samples.
+    Each metric is the largest of all segments, except the noise floor, which belongs to the segment
+    with the largest peak hysteresis, and the sensor noise, which is the rms over all steady
+    samples. Cycles and steady samples are summed; extremes include all recorded samples.
 
     Attributes:
         reason: Why the run ended, or that the recording is truncated.
@@ -94,8 +94,8 @@ class RunReport(RunMetrics):
             dropped.
         samples: Samples of the waveform.
         ramp_samples: Samples of the ramps to the safe value, before and after it.
-        recorded_samples: Both.
-        dropped: Samples that were exchanged or due and are missing.
+        recorded_samples: Samples of the waveform and of the ramps.
+        dropped: Samples that were exchanged or due but are not recorded.
         skipped_ticks: Ticks skipped because one was too late; None if not recorded.
         deadline_misses: Text with the share of skipped ticks and its evaluation; empty if there are
             none or it is unknown.
@@ -111,8 +111,9 @@ class RunReport(RunMetrics):
         late_ticks: Late ticks; None if not recorded.
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of the lateness of ticks;
             empty without ticks.
-        lateness_by_minute: The same of each minute, with ``minute`` from 0 and its ``ticks``.
-        exchange_us: The same for the duration of exchanges with the device.
+        lateness_by_minute: The same percentiles per minute, with ``minute`` from 0 and ``ticks``,
+            their number.
+        exchange_us: The same percentiles of the duration of exchanges with the device.
         adapted: Final parameters of the adaptation, see :data:`hilctl.base.events.ADAPTED`; empty
             without adaptation.
         processes: Resource usage of ``loop`` and ``supervisor``; empty if not recorded.
@@ -236,7 +237,7 @@ def quality_rows(report: RunReport) -> list[tuple[str, str]]:
         ("sensor noise", report.sensor_noise_um, "um", " rms"),
     ]
     known = [(name, number(v, unit) + more) for name, v, unit, more in rows if v is not None]
-    first = "" if report.settled else " (the first depends on the motion before it: record more)"
+    first = "" if report.settled else " (the first depends on earlier motion: record more cycles)"
     counts = (
         ("steady cycles", report.steady_cycles, first),
         ("evaluated samples", report.steady_samples, ""),

@@ -12,7 +12,7 @@ from hilctl.loop.pacer import USUAL_MISSED_SHARE, deadline_misses
 from hilctl.recording.recording import Recording, Ticks
 
 MOST_EXACT = 2**21
-"""Most values that are all kept."""
+"""Largest number of values that are kept without reduction."""
 
 
 class Quantiles:
