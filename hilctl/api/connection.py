@@ -23,7 +23,7 @@ if TYPE_CHECKING:
 
 
 def connect(run: str | None = None) -> "RunConnection":
-    """Return an active run.
+    """Return the connection to an active run.
 
     Args:
         run: Its name, or the beginning of it; required if several runs are active.
@@ -55,7 +55,7 @@ class RunConnection:
         return self._folder.card.recording
 
     def status(self) -> dict[str, Any]:
-        """Return the status; ``state`` tells if the run no longer answers."""
+        """Return the status; ``state`` shows whether the run still answers."""
         return status_of(self._folder)
 
     def set(

@@ -87,7 +87,7 @@ def _request(
     """Return a fit to files, and how their tables were read."""
     loaded, unit = load_records(paths, settings, lag_samples), settings.table.unit
     if loaded.unit and unit and loaded.unit != unit:
-        raise InputError(f"--unit must be {loaded.unit}, that of the files: {unit}")
+        raise InputError(f"--unit must be {loaded.unit}, the unit of the files (got {unit})")
     every = settings.model_copy(update={"leave_out": ()})
     held_out = load_records(validate, every, lag_samples).records
     request = FitRequest(
@@ -104,7 +104,7 @@ class LoadedModel:
 
     ``forward`` and ``inverse`` are streaming operators (:class:`hilctl.models.base.Operator`): a
     call processes the next block of a signal, ``state()`` and ``restore()`` copy the state, and
-    ``reset()`` starts again from rest. The output of ``inverse`` is that of the reference
+    ``reset()`` starts again from rest. Each output of ``inverse`` belongs to the reference
     ``inverse.preview`` samples before.
 
     Attributes:
@@ -147,7 +147,7 @@ def load_model(path: PathLike, sample_rate_hz: float) -> LoadedModel:
 
     Raises:
         InputError: The file cannot be read, or the sample rate is not > 0.
-        ConfigError: It breaks a rule or has no inverse; all problems are listed.
+        ConfigError: The model breaks a rule or has no inverse; all problems are listed.
     """
     check_rate(sample_rate_hz)
     model = read_model(Path(path))
@@ -200,7 +200,8 @@ def refine(
 ) -> Refinement:
     """Identify a model from recordings of runs; the file is written only if the model is better.
 
-    The new model is that of :func:`identify` with ``whole=true``; the old one is only compared.
+    The new model is identified as by :func:`identify` with ``whole=true``, independently of the old
+    one.
 
     Args:
         model: Model file.

@@ -83,7 +83,7 @@ def _time_range(from_s: float | None, to_s: float | None) -> TimeRange | None:
 def stream_of(
     run: PathLike, from_s: float | None = None, to_s: float | None = None
 ) -> RecordingStream:
-    """Return a recording to be read in pieces, after dead runs are finished."""
+    """Return a recording to read in pieces; complete the recordings of crashed runs first."""
     finish_dead_runs()
     return RecordingStream(Path(run), _time_range(from_s, to_s))
 
@@ -91,7 +91,7 @@ def stream_of(
 def recording_of(
     run: RecordedRun | PathLike, from_s: float | None = None, to_s: float | None = None
 ) -> Recording | RecordingStream:
-    """Return a recording in memory, or one to be read in pieces, which a time range needs."""
+    """Return a recording in memory, or one to read in pieces; a time range needs the latter."""
     if not isinstance(run, RecordedRun):
         return stream_of(run, from_s, to_s)
     if _time_range(from_s, to_s) is not None:

@@ -148,7 +148,7 @@ def run(
         settings: Overrides of the experiment.
         fast: Simulate without waiting; simulated devices only, any computer.
         overwrite: Replace an existing recording.
-        take_over: Use the device although another user's process has it.
+        take_over: Use the device even if another user's process holds it.
         on_progress: Called with each batch of samples of a run in real time.
 
     Returns:

@@ -14,7 +14,7 @@ from rich.text import Text
 from hilctl.base.formatting import printable
 from hilctl.cli.output import SafeStream, Verbosity
 
-_ONCE = "hilctl: compiling for this machine, about 10 s in all, and only this once:"
+_ONCE = "hilctl: compiling for this machine, only once, about 10 s:"
 
 
 class SafeConsole(Console):

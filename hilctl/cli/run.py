@@ -67,7 +67,7 @@ def run(
     ] = False,
     take_over: Annotated[
         bool,
-        typer.Option("--take-over", help="Use the device although another user's process has it."),
+        typer.Option("--take-over", help="Use the device even if another user's process holds it."),
     ] = False,
     as_json: AsJson = False,
 ) -> None:
