@@ -36,8 +36,8 @@ class LoopScore:
 class StrokeError:
     """Error of a model on motions of one class of strokes, each in percent of its own peak-to-peak.
 
-    Long records are cut into motions. The error of a record is that of 95 % of its motions, and
-    that of the class is the largest of a record.
+    Long records are cut into motions. The peak error of a record is the 95th percentile of its
+    motions, and the error of the class is the largest of all records.
     """
 
     label: str  # class, see :data:`hilctl.models.base.STROKES`
@@ -152,7 +152,7 @@ def motions_of(
         span_um = float(np.ptp(measured_um[place]))
         label = stroke_class(span_um / stroke_um)
         if places and STROKES[label] < 1.0:
-            # Parts of histories are as large as their class allows, but stand for all of it.
+            # Parts of histories are as large as their class allows, but represent all of it.
             span_um = min(span_um, STROKES[label] * stroke_um)
         to_percent = 100.0 / span_um
         errors_um = cycle_metrics.peak(error_um), cycle_metrics.rms(error_um)

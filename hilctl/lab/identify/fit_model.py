@@ -204,7 +204,7 @@ def fit_kind(request: FitRequest) -> FoundModel:
     try:
         found = settings.fit.fit(job)
     except ValidationError as error:
-        rule = f"the best fit of --model {settings.kind} is no valid model"
+        rule = f"the best fit of --model {settings.kind} is not a valid model"
         cure = "choose another kind, or remove faulty samples (steps, spikes, drift) from the data"
         raise DataError(f"{rule} ({error.errors()[0]['msg']}): {cure}") from None
     known, parameters, numbers = dict[str, Any](), dict(found.parameters), found.numbers
@@ -305,7 +305,7 @@ def fit_model(request: FitRequest) -> FittedModel:
 
     The linear algebra is many small steps: with more than one BLAS thread on a busy machine they
     take up to 30 times as long, so programs set ``OPENBLAS_NUM_THREADS=1`` before NumPy loads.
-    Raise DataError if the data cannot be used as asked, or there are none.
+    Raise DataError if the data do not suit the settings, or there are none.
     """
     begin, settings = time.perf_counter(), request.settings
     data = FitData(request.records, request.unit)

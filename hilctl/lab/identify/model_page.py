@@ -38,12 +38,12 @@ def identification_page(found: Identification) -> str:
     body = _head(fit.model, [*summary(found), fit.model.provenance.method])
     body += errors_by_stroke(found.verdict)
     if (held_out := found.held_out) is not None:
-        body += ["<h2>Errors on data not fitted</h2>"]
+        body += ["<h2>Errors on held-out data</h2>"]
         body += [html.grid(*loop_table(held_out.judgement.errors))]
-        body += ["<h2>Model and data not fitted</h2>"]
+        body += ["<h2>Model and held-out data</h2>"]
         body += drawn_records(held_out.judgement, held_out.records, unit)
     body += [
-        "<h2>Errors on data fitted</h2>",
+        "<h2>Errors on fitted data</h2>",
         html.grid(*loop_table(fit.errors)),
         "<h2>Model and data</h2>",
         *drawn_records(fit, found.data, unit),
@@ -143,7 +143,7 @@ def refinement_page(found: Refinement) -> str:
     by_run, by_stroke = change_tables(found)
     body = [
         *_head(found.model, [*refinement_lines(found), found.held_out.how]),
-        "<h2>Errors on data not fitted</h2>",
+        "<h2>Errors on held-out data</h2>",
         html.grid(*by_run),
         "<h2>Errors by stroke</h2>",
         html.grid(*by_stroke),

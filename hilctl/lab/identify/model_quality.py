@@ -70,7 +70,7 @@ def verdict_of(
     fit: FittedModel, records: Sequence[Record], settings: FitSettings, held_out: HeldOut | None
 ) -> Verdict:
     """Return the grade of a fit to records, and on held-out data if there are any."""
-    # No motion may have a smaller error than the fitted ones, which are more.
+    # The larger error counts: fitted motions are more numerous than held-out ones.
     classes = largest_errors((*(held_out.judgement.classes if held_out else ()), *fit.classes))
     within = max(each.peak_percent for each in classes)
     verdict = partial(
@@ -137,7 +137,7 @@ def _cause(
 
 
 def _noise(errors_um: Sequence[F64]) -> str:
-    """Return that most of the error is noise, which has no relation from sample to sample."""
+    """Return a message if most of the error is noise, uncorrelated from sample to sample."""
     noise_um2 = 0.5 * float(np.var(np.concatenate([np.diff(each) for each in errors_um])))
     if noise_um2 <= NOISY * float(np.concatenate(errors_um).var()):
         return ""
@@ -148,7 +148,7 @@ def _noise(errors_um: Sequence[F64]) -> str:
 
 
 def _drift(error_um: F64, record: Record, *, hidden: bool) -> str:
-    """Return that most of the error in a history is a linear drift of the displacement."""
+    """Return a message if most of the error in a history is a linear drift of the displacement."""
     if isinstance(record, SteadyLoop):
         return ""
     first = record.command.size - error_um.size

@@ -1,7 +1,7 @@
 """Choose the kind of model and the lag of tables by errors on held-out data.
 
-A kind is chosen by the geometric mean of its errors by stroke. The rms error of whole histories is
-that of their large motions, and does not show a kind whose small loops are several times worse.
+A kind is chosen by the geometric mean of its errors by stroke. Large motions dominate the rms error
+of whole histories, which hides a kind whose small loops are several times worse.
 """
 
 from collections.abc import Callable, Mapping, Sequence

@@ -33,7 +33,7 @@ def parallel_map(function: Callable[[Task], Result], tasks: Iterable[Task], /) -
 
 
 class _UnwantedError(Exception):
-    """Cancels a fit whose result is not wanted any more."""
+    """Cancels a fit whose result is no longer needed."""
 
 
 _worker = threading.local()

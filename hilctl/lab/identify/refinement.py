@@ -60,7 +60,7 @@ class Refinement:
 
     @property
     def ratio(self) -> float:
-        """Mean error by stroke after, over that before."""
+        """Mean error by stroke of the new model, over that of the old one."""
         return self.after.stroke_percent / self.before.stroke_percent
 
     def __str__(self) -> str:
@@ -69,7 +69,7 @@ class Refinement:
         return f"better: {_mean_errors(self.before, self.after)}"
 
     def to_mapping(self) -> dict[str, Any]:
-        """Return all figures as plain mappings, lists and numbers, for JSON."""
+        """Return all results as plain mappings, lists and numbers, for JSON."""
         return {
             "better": self.better,
             "text": str(self),
@@ -133,7 +133,7 @@ def _error(found: Identification) -> float:
 
 
 def _means_um(found: Identification) -> tuple[F64, float]:
-    """Return the mean error of each record, and the part of the mean square error that it is."""
+    """Return the mean error of each record, and its share of the mean square error."""
     errors_um = [
         record.displacement_um[-modelled_um.size :] - modelled_um
         for record, modelled_um in zip(found.data, found.fit.modelled_um, strict=True)

@@ -29,8 +29,8 @@ class Fit:
         title: Equations of the model.
         found_by: Method.
         data: Records that it takes, in words.
-        fit: Raise DataError if the data are not suitable.
-        takes: Names of its settings, of those that not all kinds have.
+        fit: Returns the model; raises DataError if the data are not suitable.
+        takes: Names of its settings, except those of all kinds.
         published: Defaults of settings that differ from the usual ones.
         own: Further settings, of another package; their names are ``own.NAME``.
         compared: Settings for ``hilctl compare``; None if it is compared by name only.

@@ -44,7 +44,7 @@ def summary(found: Identification) -> list[str]:
     """Return the result in a few lines, the grade first."""
     fit, held_out, known = found.fit, found.held_out, found.fit.model.provenance.identified_range
     spread = [start.rms_percent for start in fit.starts]
-    ended = f"{fit.numbers} fitted numbers"
+    ended = f"{fit.numbers} fitted parameters"
     if spread:
         ended = f"{len(spread)} starts ended at rms {min(spread):.3f} to {max(spread):.3f} %"
     lines = [str(found.verdict), *found.verdict.notes, *found.understood]

@@ -94,7 +94,7 @@ def _refined(command: F64, period: float) -> float:
 
 
 def steady_stretch(command: F64, period: float) -> tuple[int, int] | None:
-    """Return the longest part of two periods in which a command repeats fully, or None."""
+    """Return the longest part in which a command repeats, if it has two periods; None otherwise."""
     span = float(np.ptp(command))
     later = np.arange(command.size - math.ceil(period))
     again = np.interp(later + period, np.arange(command.size), command)

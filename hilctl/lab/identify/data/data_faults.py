@@ -105,7 +105,7 @@ def _clipped(record: Record) -> str:
 
 
 def _still(record: Record) -> str:
-    """Return in which part of a history the displacement does not move and the command does."""
+    """Return a message on a part of a history in which the command moves, the displacement not."""
     if not isinstance(record, History):
         return ""
     turns, y = turning_points(record.command), record.displacement_um
@@ -146,7 +146,7 @@ def _without(record: Record, start: int, stop: int) -> str:
 
 
 def _far_from_zero(record: Record, settings: FitSettings) -> str:
-    """Return that the displacement has a constant that the model lacks."""
+    """Return a message if the displacement has an offset that the model lacks."""
     if settings.fit.has_offset:
         return ""
     middle_um = 0.5 * float(record.displacement_um.max() + record.displacement_um.min())

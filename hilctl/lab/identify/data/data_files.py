@@ -102,7 +102,7 @@ def _check_stroke(path: Path, history: History) -> None:
 def _columns(table: Table, settings: TableSettings) -> list[int]:
     """Return the columns of command, displacement and, without a rate, time.
 
-    Raise DataError with the options of all that are not known.
+    Raise DataError with the option of each column that is unknown.
     """
     named, shown = settings.command_column, settings.displacement_column
     found = {

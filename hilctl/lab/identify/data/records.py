@@ -86,7 +86,7 @@ class History:
         return np.asarray(np.arange(self.command.size) / self.sample_rate_hz, dtype=np.float64)
 
     def without_lag(self, lag_samples: int) -> "History":
-        """Return the history with the displacement taken later, by a lag outside the model."""
+        """Return the history with the displacement advanced by a lag that is not in the model."""
         if lag_samples < 0:
             raise DataError(f"{self.label}: lag_samples must be >= 0: {lag_samples}")
         end = self.command.size - lag_samples

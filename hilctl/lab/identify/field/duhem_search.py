@@ -167,7 +167,7 @@ class DuhemEnd:
 
 @dataclass(frozen=True, slots=True)
 class Bounds:
-    """Bounds of search variables and of logarithms of slopes, and where stages are held."""
+    """Bounds of search variables and of logarithms of slopes, and values to hold stages at."""
 
     low: F64
     high: F64
@@ -232,7 +232,7 @@ class DuhemProblem:
         return stages, fading(table) if self._phase.fades else table
 
     def _moved(self, x: F64) -> F64:
-        """Return the change of stages from where they are held, in steps."""
+        """Return the deviation of stages from their held values, in steps."""
         return np.asarray((x - self._bounds.first) / STEPS)
 
     def _cost(self, x: F64, logs: F64, errors: F64) -> float:

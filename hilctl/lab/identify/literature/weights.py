@@ -13,7 +13,7 @@ DENSITIES = "non-negative least squares with a smoothness prior"
 SMOOTHNESS = 0.01  # increases no error, but makes the solution unique
 STILL = 0.05
 """Part of its range that an operator must move through in a loop to have a weight. An operator that
-moves only on the way from rest would describe how the means of the loops differ."""
+moves only in the first rise from rest would fit the differences of the loops' means."""
 
 
 def weigh(job: FitJob, columns: F64, least: F64, rows: slice = slice(None)) -> tuple[F64, float]:

@@ -51,7 +51,7 @@ def loop_delay_slope(half_period_s: float, lag_s: float) -> float:
 
 @dataclass(frozen=True, slots=True)
 class Layers:
-    """Parts of the model."""
+    """Structure of the model: its operators and stages."""
 
     plays: int
     deadbands: int

@@ -49,7 +49,7 @@ def test_a_parameter_on_a_bound_is_marked():
 def test_starts_that_ended_apart_are_shown_by_their_spread():
     spread = "2 starts ended at rms 0.750 to 0.800 %, in 1.23 s"
     assert summary(found(starts=(0.75, 0.8)))[-1] == spread
-    assert summary(found())[-1] == "7 fitted numbers, in 1.23 s"
+    assert summary(found())[-1] == "7 fitted parameters, in 1.23 s"
 
 
 def test_what_was_not_fitted_comes_before_what_was():
