@@ -22,7 +22,7 @@ def read(path: Path) -> dict[str, npt.NDArray[Any]]:
     try:
         stored = loadmat(path, simplify_cells=True)
     except NotImplementedError:
-        rule = "is of MATLAB 7.3, which is not read: save it with -v7, or as .csv or .parquet"
+        rule = "is a MATLAB 7.3 file, which is not supported: save with -v7, or as .csv or .parquet"
         raise InputError(f"{path}: {rule}") from None
     except Exception as error:  # noqa: BLE001  SciPy raises errors of many kinds on damaged files
         raise InputError(f"{path}: is not a MATLAB file (.mat): {error}") from None
@@ -56,9 +56,7 @@ class MatFile(StoredColumns):
         super().add(columns)
         if 8 * self.rows > _LARGEST_BYTES:
             most = _LARGEST_BYTES // 8
-            raise InputError(
-                f".mat holds at most {most} samples: export a stretch (--from, --to) or .parquet"
-            )
+            raise InputError(f".mat holds at most {most} samples: use --from and --to, or .parquet")
 
     def finish(self, facts: Facts) -> None:
         """Write the file; each column is copied to memory in turn."""

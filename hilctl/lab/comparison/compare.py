@@ -157,7 +157,7 @@ def _row(
     if name.endswith(_FILES):
         model, title = load_model(Path(name)), "model file"
         if model.input_unit != data.unit:
-            raise InputError(f"{name}: must take commands in {data.unit}, as the loops do")
+            raise InputError(f"{name}: must have commands in {data.unit}, the unit of the loops")
     else:
         known = fit_named(name)
         settings = FitSettings(kind=name, **(known.compared or {}))
@@ -236,7 +236,7 @@ def check_free(
         check_no_input(path, inputs)
     taken = [path for path in paths if exists(path)]
     if taken and not overwrite:
-        raise already_there(taken[0], "give another --save, or --overwrite")
+        raise already_there(taken[0], "choose another --save, or --overwrite")
 
 
 def save_models(comparison: Comparison, folder: Path, *, created: str, overwrite: bool) -> None:

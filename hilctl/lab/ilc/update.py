@@ -1,12 +1,12 @@
 """Update of the correction from the errors so far: pure functions of frozen state.
 
-Each harmonic of the correction moves against its error by the inverse of the identified response.
-The bandwidth grows while the error falls. If the error grows, the next step starts from the best
-correction, with half the gain and a smaller bandwidth.
+Each update subtracts the error of each harmonic, filtered by the inverse of the identified
+response. The bandwidth grows while the error falls. If the error grows, the next step starts from
+the best correction, with half the gain and a smaller bandwidth.
 
 With a nearly exact compensator the response is close to a delay of some samples. The remaining
 resonance of the structure limits the bandwidth of a correction. The response is therefore a gain, a
-delay and one second-order resonance, fitted to the changes of each harmonic. Where a harmonic has
+delay and one second-order resonance, fitted to the changes of each harmonic. If a harmonic has
 changed significantly, its measured response corrects the fit, which lacks further resonances.
 """
 
@@ -135,13 +135,13 @@ FULL_GAIN = 0.9
 
 _LEAST_GAIN = 0.2
 _LEAST_STEP = 0.01
-"""Smallest gain after refused corrections: those that a limit allows are too small to help."""
+"""Smallest gain after refused corrections: smaller corrections would be allowed but do not help."""
 
 AT_FLOOR = 1.2
 """Multiple of the noise floor at which learning ends."""
 
 _FIRST_REACH = 0.01
-"""First bandwidth as a share of the sample rate, where a delay of some samples is some degrees."""
+"""First bandwidth as a share of the sample rate; a few samples of delay are a few degrees there."""
 
 _FIRST_TURN_RAD = np.pi / 6.0
 _WIDEN = 1.6
@@ -310,5 +310,5 @@ def _done(state: IlcState) -> str:
         return "at the noise floor"
     earlier = state.trials[:-_PATIENCE]
     if earlier and best.peak_um > _WORTH * min(trial.error.peak_um for trial in earlier):
-        return f"no better in {_PATIENCE} runs"
+        return f"no improvement in {_PATIENCE} runs"
     return ""

@@ -151,7 +151,7 @@ def formats_of(text: str) -> tuple[str, ...]:
     unknown = [each for each in chosen if each not in FORMATS]
     if unknown or not chosen:
         got = ", ".join(unknown) or repr(text)
-        raise InputError(f"--format: must be of {', '.join(FORMATS)}, commas between: {got}")
+        raise InputError(f"--format: must be {', '.join(FORMATS)}, separated by commas (got {got})")
     return tuple(dict.fromkeys(chosen))
 
 

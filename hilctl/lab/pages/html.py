@@ -221,8 +221,8 @@ DEFINITIONS = {
     ),
     "contour error": (
         "Distance of the measured point from the nearest point of the reference path around the "
-        "sample's reference. The error along the path, from the reference to the nearest point, is "
-        "apart from it; negative if the axes lag."
+        "sample's reference. The error along the path, from the reference to the nearest point, "
+        "is listed separately; it is negative if the axes lag."
     ),
     "asymmetry": (
         "Difference of the highest and the lowest displacement from rest, over the peak-to-peak."

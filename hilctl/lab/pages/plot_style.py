@@ -117,7 +117,7 @@ def _band(axes: Axes, t: F64, low: F64, high: F64, colour: str, label: str, outl
 def draw_line(
     axes: Axes, t: F64, values: F64, colour: str, label: str = "", *, dashed: bool = False
 ) -> None:
-    """Draw a signal as a line of at most :data:`MAX_POINTS` points; without any value, nothing."""
+    """Draw a signal as a line of at most :data:`MAX_POINTS` points; nothing without values."""
     if not np.isfinite(values).any():
         return
     width, style = (0.9, "--") if dashed else (1.5, "-")

@@ -1,7 +1,8 @@
 """Feedback from a measured response: the largest integral gain with its margins, and the open loop.
 
 The response is from the compensator's input to the displacement. It may be measured in closed loop,
-because the periods of a multisine average what the feedback makes of noise and drift.
+because averaging over the periods of a multisine suppresses noise and drift, also those that the
+feedback returns.
 """
 
 import math
@@ -47,7 +48,7 @@ _GAINS = {"bandwidth_hz", "kp", "ki_per_s", "resonance_hz", "damping_ratio", "re
 
 @dataclass(frozen=True, slots=True)
 class LoopMargins:
-    """Figures of an open loop."""
+    """Crossover, margins and peak sensitivity of an open loop."""
 
     crossover_hz: float  # lowest frequency at which its gain is 1
     gain_margin_db: float
@@ -56,7 +57,7 @@ class LoopMargins:
 
     @classmethod
     def of(cls, loop: LoopResponse) -> "LoopMargins":
-        """Return the figures of an open loop."""
+        """Return the margins of an open loop."""
         crossing = int(np.argmax(loop.size < 1.0))
         sensitivity = 1.0 / np.abs(1.0 + loop.size * np.exp(-1j * loop.lag))
         return cls(float(loop.frequency_hz[crossing]), *loop.margins, float(sensitivity.max()))
@@ -69,8 +70,8 @@ class FeedbackDesign:
 
     Attributes:
         feedback: Keys of the proposed ``feedback``.
-        proposed: Figures of its open loop.
-        recorded: Figures of the feedback of the run; None if it had none.
+        proposed: Margins of its open loop.
+        recorded: Margins of the feedback of the run; None without one.
     """
 
     path: Path
@@ -156,7 +157,7 @@ def _measured(recording: Recording) -> MeasuredResponse:
 
 
 def _kept(config: Experiment) -> dict[str, Any]:
-    """Return the recorded keys that stay, or the default limit: a tenth of the stroke limits."""
+    """Return the recorded keys to keep, or the default limit: a tenth of the stroke limits."""
     if (known := config.feedback) is not None:
         return known.model_dump(exclude=_GAINS, exclude_defaults=True)
     low_um, high_um = config.limits.stroke_um
@@ -164,7 +165,7 @@ def _kept(config: Experiment) -> dict[str, Any]:
 
 
 def figure_rows(design: FeedbackDesign) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
-    """Return headings and rows of the figures of the proposed and the recorded loop."""
+    """Return headings and rows of the margins of the proposed and the recorded loop."""
     rows: list[tuple[str, ...]] = [
         (
             name,

@@ -1,8 +1,8 @@
 """Frequency response of a recording: multisine, random, chirp or a sequence of sines, and its fit.
 
 The displacement of a sample is read when its command is output. Each command is held for a sample,
-which delays the response from it by half a sample and attenuates high frequencies; the fit contains
-both, and the fitted delay and lag do not.
+which delays the response by half a sample and attenuates high frequencies. The fit accounts for
+both, so the fitted delay and lag exclude them.
 
 Sources: R. Pintelon, J. Schoukens, System Identification: A Frequency Domain Approach (2012), for
 periodic excitation and free lines; J. S. Bendat, A. G. Piersol, Random Data (2010), for the errors
@@ -251,7 +251,7 @@ def _columns(recording: Recording, signals: Signals) -> list[str]:
     units = {"displacement": "_um", "reference": "_um", "input": "_um"}
     columns = [f"{each}{units.get(each, '')}" for each in signals.split("-")]
     if not recording.samples.index.size:
-        raise DataError(f"{recording.path}: holds no sample")
+        raise DataError(f"{recording.path}: contains no samples")
     for name in columns:
         if not np.isfinite(recording.samples.column(name)).any():
             raise InputError(f"{recording.path}: {name} is not recorded: use other --signals")

@@ -45,7 +45,7 @@ def fitted_fields(
     sign = math.copysign(1.0, response[0].real)
     turns = hz / rate_hz
     half = np.exp(-1j * np.pi * turns) if held else np.ones(hz.size, complex)
-    # What is slower than the samples smooths the steps; what is faster ends each within a sample.
+    # Dynamics slower than the samples smooth the steps; faster ones settle within a sample.
     holds = [half, half * np.sinc(turns)] if held else [half]
     fits = [
         (hold, _chosen(hz, sign * response / hold, noise / np.abs(hold), rate_hz)) for hold in holds

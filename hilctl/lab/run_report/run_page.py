@@ -254,7 +254,7 @@ def _model(recording: Recording) -> Iterator[tuple[str, str]]:
 def model_error(model: HysteresisModel) -> str:
     """Return the error of a model, on data outside the fit if known."""
     errors = model.provenance.errors_percent
-    for prefix, of in (("held_out_", "on data not fitted"),
+    for prefix, of in (("held_out_", "on held-out data"),
                        ("", "on the data of the fit (no validation data)")):  # fmt: skip
         peak, rms = errors.get(f"{prefix}peak"), errors.get(f"{prefix}rms")
         if peak is not None:

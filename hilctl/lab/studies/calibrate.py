@@ -82,7 +82,7 @@ class SensorPoints(NamedTuple):
 
 
 def sensor_points(path: Path, reading: Column | None, true: Column | None) -> SensorPoints:
-    """Return the points in two columns of a table; None is the column that its name tells.
+    """Return the points in two columns of a table; None selects a column by its name.
 
     Raise DataError if a column is missing, unknown or not a length, or there are too few readings.
     """
@@ -121,8 +121,8 @@ def _columns(table: Table, asked: dict[str, Column | None]) -> list[int]:
 def fit_sensor(points: SensorPoints, origin: Origin) -> CalibrationFit:
     """Fit the curve of a sensor: the lowest order that the noise supports, or else a table.
 
-    Raise DataError if points are outliers, or the fitted displacement does not rise
-    with the reading, or not as far.
+    Raise DataError if points are outliers, or the fitted displacement does not rise with the
+    reading, or rises by a very different amount.
     """
     path, reading, true, _ = points
     if found := _outliers(points):
@@ -301,7 +301,7 @@ def _amplifier_fit(
 def existing_calibration(path: Path, part: str, *, overwrite: bool) -> CalibrationFile | None:
     """Return the calibration in the file to write, None without one.
 
-    Raise InputError if it has this part already, is something else, or cannot be written.
+    Raise InputError if it has this calibration already, is no calibration, or cannot be written.
     """
     if not exists(path):
         check_writable(path, overwrite=overwrite)
@@ -314,7 +314,7 @@ def existing_calibration(path: Path, part: str, *, overwrite: bool) -> Calibrati
 def write_calibration(
     path: Path, fitted: SensorCalibration | AmplifierCalibration, before: CalibrationFile | None
 ) -> None:
-    """Write a calibration file, with the other part of the file before."""
+    """Write a calibration file, and keep the other calibration of an existing one."""
     part = "sensor" if isinstance(fitted, SensorCalibration) else "amplifier"
     kept = {} if before is None else before.parts
     written = CalibrationFile.model_validate(kept | {part: fitted})

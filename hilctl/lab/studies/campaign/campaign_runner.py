@@ -2,8 +2,8 @@
 
 Completed steps are kept, failed ones marked; a fault of the rig ends a campaign. A worker receives
 the checked texts of a simulated run and returns the recording as bytes, so it does not need access
-to the campaign's folder. The coil starts each such run with the heat that it would have if the
-steps and their pauses followed each other.
+to the campaign's folder. Each such run starts with the coil heat that the preceding steps and
+pauses would leave in real time.
 """
 
 import math

@@ -45,9 +45,9 @@ from hilctl.run.start import checked_experiment
 
 
 def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
-    """Return settings with a hold as waveform, without what belongs to the experiment's own one.
+    """Return settings with a hold as waveform, without all keys that need the experiment's own one.
 
-    That is the compensator, all that needs one, and the trigger.
+    These are the compensator, all keys that need a compensator, and the trigger.
     """
     document = document_with(experiment, settings)
     unit = "V" if document.holds(("limits", "drive_v")) else "A"

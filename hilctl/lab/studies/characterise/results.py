@@ -197,9 +197,9 @@ def identified(recordings: Mapping[str, Path], small: FrequencyResponse | None) 
 def _history(recording: Recording) -> History:
     """Return a recording up to the end of its last waveform, with gaps filled.
 
-    Until the first waveform has been at both of its ends, the displacement depends on what the
-    actuator did before, so that part is not evaluated. A simulated actuator begins at rest: the
-    whole history of a drive of one sign, which never erases that state, is evaluated.
+    Until the first waveform has reached both of its ends, the displacement depends on earlier
+    motion, so these samples are not evaluated. A simulated actuator starts at rest. If its drive
+    has one sign, that state is never erased, and the whole history is evaluated.
     """
     stop = recording.segments[-1].steady_stop
     command, displacement_um = without_gaps(recording, 0, stop)

@@ -42,7 +42,7 @@ _SETTLED = (
     (0.1, (-0.9, -0.45, 0.0, 0.45, 0.9)),
     (0.25, (-0.75, -0.375, 0.0, 0.375, 0.75)),
 )
-"""Amplitudes of loops that settle, of half the stroke, and their places about its middle."""
+"""Amplitudes of loops that settle, of half the stroke, and their offsets from its middle."""
 _MOST_COMMAND = 3.0  # of a loop that settles, relative to the one in the middle
 _RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
 
@@ -202,8 +202,8 @@ def settled_loops(limits: CharacterisationLimits, amplitude: float, line: F64) -
 
     ``line`` are commands at even steps of the displacement over the whole stroke, float64[k].
     """
-    # A small loop drifts in its first cycles. Random motions do not show where it settles. As in
-    # a run it starts within a cycle: the offset of its first cycle is that of the way to it.
+    # A small loop drifts in its first cycles, and random motions do not show where it settles. As
+    # in a run, it starts within a cycle, so the path to it sets the offset of its first cycle.
     stroke = np.linspace(-1.0, 1.0, line.size)
     parts = []
     for hz in (limits.middle_hz, _RANDOM_BAND[1] * limits.highest_hz):
@@ -211,7 +211,7 @@ def settled_loops(limits: CharacterisationLimits, amplitude: float, line: F64) -
             ends = [np.interp([at - size, at + size], stroke, line).tolist() for at in places]
             middle = ends[len(ends) // 2]
             most = _MOST_COMMAND * (middle[1] - middle[0])
-            # A loop in saturation has other densities than a fit can have beside the rest.
+            # One fit cannot have the densities of a loop in saturation and those of all others.
             parts += [
                 sine(limits, 0.5 * (high - low), hz, 4.0, offset=0.5 * (low + high), soft=1.0)
                 for low, high in ends
