@@ -88,8 +88,7 @@ class ReplayResult:
     """Comparison of recomputed and recorded commands.
 
     Attributes:
-        left_out_samples: Samples after damage of the file, where the compensator's memory is
-            unknown.
+        left_out_samples: Samples after damage of the file, with unknown compensator memory.
         identical: Whether every wanted command, command and flag has the same bits.
         first_difference: Index of the first sample that differs, or None.
         largest_difference: Largest magnitude of a difference between commands.

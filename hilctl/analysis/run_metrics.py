@@ -111,8 +111,7 @@ class RunReport(RunMetrics):
         late_ticks: Late ticks; None if not recorded.
         lateness_us: ``p50``, ``p90``, ``p99``, ``p99.9`` and ``max`` of the lateness of ticks;
             empty without ticks.
-        lateness_by_minute: The same percentiles per minute, with ``minute`` from 0 and ``ticks``,
-            their number.
+        lateness_by_minute: The same percentiles per minute, with ``minute`` from 0 and ``ticks``.
         exchange_us: The same percentiles of the duration of exchanges with the device.
         adapted: Final parameters of the adaptation, see :data:`hilctl.base.events.ADAPTED`; empty
             without adaptation.

@@ -200,8 +200,7 @@ def refine(
 ) -> Refinement:
     """Identify a model from recordings of runs; the file is written only if the model is better.
 
-    The new model is identified as by :func:`identify` with ``whole=true``, independently of the old
-    one.
+    The new model is identified as by :func:`identify` with ``whole=true``, without the old one.
 
     Args:
         model: Model file.

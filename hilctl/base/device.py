@@ -118,10 +118,9 @@ class DeviceInfo:
         holds: Resources that it uses exclusively while open, with a name common to all devices
             (``serial:/dev/ttyUSB0``, ``tcp:10.0.0.5:502``). Empty for a device without such a
             resource.
-        identity: Names that identify the device with the output, to find its last run: those in
-            ``holds``, the most stable first, and the serial number of its USB adapter, prefixed by
-            ``usb:``. If two devices have a serial number, only these are compared. Empty:
-            ``holds``.
+        identity: Names that identify the last run of the output's device: those in ``holds``, the
+            most stable first, and the serial number of its USB adapter, prefixed by ``usb:``. If
+            two devices have such a number, only these are compared. Empty: ``holds``.
         output: Name of the output among those of the device; empty if there is one.
         simulated: Whether it drives no hardware and steps on sample count, so that it may run
             faster than real time.

@@ -17,8 +17,7 @@ from hilctl.base.formatting import did_you_mean
 class TextFiles:
     """Text files that are read from disk once.
 
-    The loop process receives the texts that the check has read, so that a run uses the checked
-    ones.
+    The loop process receives the texts that the check has read, so that it uses the checked files.
 
     Attributes:
         texts: The text of each file read so far, by its absolute path.

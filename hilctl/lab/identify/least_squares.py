@@ -131,8 +131,7 @@ def _step(errors: F64, slopes: F64, low: F64, high: F64, damping: float) -> F64:
 
 def bounded_solution(normal: F64, right: F64, low: F64, high: F64) -> F64:
     """Minimise x^T A x / 2 - b^T x within bounds around 0, A positive definite."""
-    # Active set: variables beyond a bound are fixed; those that the slope pulls inwards are
-    # released.
+    # Active set: variables beyond a bound are fixed; those that the slope pulls back are free.
     x = np.zeros(right.size)
     inside = np.ones(right.size, dtype=bool)
     for _ in range(3 * right.size):
