@@ -53,8 +53,7 @@ class ContourMetrics:
         peak_um: Largest contour error.
         along_mean_um: Mean along-path error; negative if the axes lag.
         lag_s: Mean lag: the mean along-path error over the mean speed of the reference.
-        limited_samples: Samples whose lag or lead is at the search limit :data:`MOST_REACH` or
-            beyond.
+        limited_samples: Samples with lag or lead at the search limit :data:`MOST_REACH`.
     """
 
     samples: int
@@ -210,8 +209,7 @@ def contour(
 ) -> tuple[ContourReport, tuple[ContourTrace | None, ...]]:
     """Return the contour errors of a run, and the last samples of each segment, None without any.
 
-    If the waveforms of all axes have a common period, the last samples are those of one such
-    period.
+    If the waveforms of all axes have a common period, the last samples are one such period.
 
     ``runs`` are the recordings of its axes by name, as repeatable iterables of pieces, which are
     read two or three times, in bounded memory. Raise DataError as
@@ -228,7 +226,7 @@ def contour(
         _overlaps,
         (
             [
-                _SharedSegment((segment.label,), start, stop, (segment.period,))
+                _Shared((segment.label,), start, stop, (segment.period,))
                 for segment, (start, stop, _) in each.windows
             ]
             for each in builders.values()
@@ -241,13 +239,13 @@ def contour(
             part.add(found)
     segments = tuple(part.segment() for part in parts)
     report = ContourReport(
-        **total.metrics(), axes=reports, skew_us=skew.figures_us(), segments=segments
+        **total.metrics(), axes=reports, skew_us=skew.metrics_us(), segments=segments
     )
     return report, tuple(part.trace() for part in parts)
 
 
 @dataclass(frozen=True, slots=True)
-class _SharedSegment:
+class _Shared:
     """Evaluated samples of one segment of each axis, and the periods of its waveforms."""
 
     labels: tuple[str, ...]
@@ -255,8 +253,8 @@ class _SharedSegment:
     stop: int
     periods: tuple[float, ...]
 
-    def overlap(self, other: "_SharedSegment") -> "_SharedSegment":
-        return _SharedSegment(
+    def overlap(self, other: "_Shared") -> "_Shared":
+        return _Shared(
             self.labels + other.labels,
             max(self.start, other.start),
             min(self.stop, other.stop),
@@ -275,7 +273,7 @@ class _SharedSegment:
         return whole
 
 
-def _overlaps(some: list[_SharedSegment], others: list[_SharedSegment]) -> list[_SharedSegment]:
+def _overlaps(some: list[_Shared], others: list[_Shared]) -> list[_Shared]:
     found = (one.overlap(other) for one in some for other in others)
     return [each for each in found if each.start < each.stop]
 
@@ -354,9 +352,7 @@ class _Errors:
 class _Part:
     """Contour errors of a segment; they are also added to those of the run."""
 
-    def __init__(
-        self, segment: _SharedSegment, rate_hz: float, total: _Errors, most_traced: int
-    ) -> None:
+    def __init__(self, segment: _Shared, rate_hz: float, total: _Errors, most_traced: int) -> None:
         self._segment, self._rate_hz, self._total = segment, rate_hz, total
         self._traced = min(segment.traced(), max(most_traced, 2))
         self._traces: deque[ContourTrace] = deque()
@@ -406,7 +402,7 @@ class _Skew:
             self._sum_ns += after_ns.sum(axis=0)
             self._largest_ns = np.maximum(self._largest_ns, np.abs(after_ns).max(axis=0))
 
-    def figures_us(self) -> dict[str, dict[str, float]]:
+    def metrics_us(self) -> dict[str, dict[str, float]]:
         if not self._ticks:
             return {}
         figures = zip(self._others, self._sum_ns / self._ticks, self._largest_ns, strict=True)

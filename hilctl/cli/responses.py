@@ -20,8 +20,7 @@ from hilctl.cli.options import (
 )
 from hilctl.cli.output import print_result
 from hilctl.lab.response.bode import fit_rows, line_table
-from hilctl.lab.response.feedback_design import FeedbackDesign
-from hilctl.lab.response.feedback_design import figure_rows as loop_rows
+from hilctl.lab.response.feedback_design import FeedbackDesign, margin_rows
 from hilctl.lab.response.frequency_response import FrequencyResponse, Signals
 from hilctl.lab.response.segment_spectrum import SegmentSpectrum, spectrum_rows
 from hilctl.lab.response.step_response import SETTLED_PERCENT, StepResponse
@@ -102,7 +101,7 @@ def tune(
 
 def print_design(design: FeedbackDesign, output: Path | None) -> None:
     """Print the margins and the section to paste."""
-    print_rich(table(str(design.path), *loop_rows(design)))
+    print_rich(table(str(design.path), *margin_rows(design)))
     print(design.to_yaml(), end="")
     if output is None:
         print("# add --output FILE and set response: FILE, so that check uses this response")

@@ -28,7 +28,7 @@ from hilctl.experiment.sections.labels import label_settings
 from hilctl.lab.studies.calibrate import CalibrationFit
 from hilctl.lab.studies.characterise.characterisation_runner import CharacterisationPlan
 from hilctl.lab.studies.characterise.results import Characterisation, StepRow
-from hilctl.lab.studies.characterise.rig_page import HELD_OUT_HEADINGS, figure_rows, held_out_rows
+from hilctl.lab.studies.characterise.rig_page import HELD_OUT_HEADINGS, held_out_rows, value_rows
 
 _RESUMES = "the same command resumes from this step"
 calibrate_ = typer.Typer(rich_markup_mode=None)
@@ -235,7 +235,7 @@ def print_characterisation(result: Characterisation, model: Path | None, page: P
             print(note)
         title = "validation errors (references that were not fitted)"
         print_rich(table(title, HELD_OUT_HEADINGS, held_out_rows(result)))
-    if figures := list(figure_rows(result)):
+    if figures := list(value_rows(result)):
         print_rich(table("measured", ("quantity", "value"), figures, left={"value"}))
     if model is not None:
         print(f"model: {model}")

@@ -122,7 +122,7 @@ class Headroom:
         self._held[gauge.name] = [*kept, (self._next_sample, gauge)]
 
 
-FigureValues: TypeAlias = dict[str, float | None]
+MetricValues: TypeAlias = dict[str, float | None]
 _GROUP_S = 0.5
 _NOISE_SAMPLES = 4096
 _LEFT_OUT = NO_WAVEFORM | Flag.SENSOR_INVALID
@@ -133,7 +133,7 @@ EDGES_US: F64 = np.concatenate(([0.0], np.geomspace(1.0, 1e6, 31)))
 _TICKS = 20_000
 
 
-class RunningFigures:
+class RunningMetrics:
     """Running metrics of one run; ``loop_input`` is the signal on the abscissa of its loop."""
 
     def __init__(self, sample_rate_hz: float, loop_input: str) -> None:
@@ -141,7 +141,7 @@ class RunningFigures:
         self._compensated = loop_input == "reference"
         self._segment: Segment | None = None
         self._group: _Group | None = None
-        self.newest: FigureValues = {}
+        self.newest: MetricValues = {}
         """Metrics of the last complete group of cycles by name with unit."""
 
     def add(self, traces: Traces, segment: Segment | None) -> None:
@@ -159,7 +159,7 @@ class RunningFigures:
             group.add(traces.part(group.start, group.stop), self._input)
             if traces.index[-1] < group.stop - 1:
                 return
-            self.newest = group.figures() or self.newest
+            self.newest = group.metrics() or self.newest
             traces, self._group = traces.part(group.stop, math.inf), None
 
     def _begin(self, segment: Segment, sample: int) -> "_Group":
@@ -195,7 +195,7 @@ class _Group:
         newest_um = np.concatenate((self._displacement_um, displacement_um))
         self._displacement_um = newest_um[-_NOISE_SAMPLES:]
 
-    def figures(self) -> FigureValues:
+    def metrics(self) -> MetricValues:
         """Return the metrics; none without a displacement."""
         if not (raw := self._metrics.raw()):
             return {}

@@ -26,7 +26,7 @@ from hilctl.live.live_metrics import (
     Headroom,
     LatenessCounts,
     LiveErrorSpectrum,
-    RunningFigures,
+    RunningMetrics,
 )
 from hilctl.live.scope import SIGNALS, WINDOWS_S, Scope, Signal, Traces, traces_of
 from hilctl.run.control.client import active_runs
@@ -56,7 +56,7 @@ class RunReader:
         self.scope = self._new_scope([])
         self._aux: list[float] = []
         self._waveform_at = -1
-        self._figures = RunningFigures(self.description.sample_rate_hz, self.loop_input)
+        self._metrics = RunningMetrics(self.description.sample_rate_hz, self.loop_input)
         self.spectrum = LiveErrorSpectrum(self.description.sample_rate_hz)
         self._lateness, self._headroom = LatenessCounts(), Headroom(self.description)
         self.events: list[Event] = []  # the newest ones, the oldest first
@@ -111,7 +111,7 @@ class RunReader:
         self._next_sample = int(traces.index[-1]) + 1
         self.scope.add(traces)
         self._aux = traces.values[len(SIGNALS) :, -1].tolist()
-        self._figures.add(traces, self.scope.segment)
+        self._metrics.add(traces, self.scope.segment)
         self.spectrum.add(traces)
         self._headroom.add(traces)
 
@@ -162,7 +162,7 @@ class RunReader:
             "t_s": max(self._next_sample, 0) / rate_hz,
             "total_s": (self.description.samples + max(self._waveform_at, 0)) / rate_hz,
             "segment": self.scope.segment.label if self.scope.segment else "",
-            "figures": self._figures.newest,
+            "figures": self._metrics.newest,
             "aux": [
                 {"name": each.name, "unit": each.unit, "value": value}
                 for each, value in zip(self.description.aux, self._aux, strict=False)

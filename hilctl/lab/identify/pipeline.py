@@ -29,7 +29,7 @@ TURNS = 4  # each identifies a new model
 
 
 @dataclass(frozen=True, slots=True)
-class Found:
+class ModalFit:
     """A model with given modes, its settings, and its errors on held-out data if there are any."""
 
     fit: FittedModel
@@ -44,8 +44,8 @@ class Found:
 
 def with_modes(
     records: Sequence[Record],
-    identify: Callable[[Sequence[FurtherMode], Selection | None], Found],
-) -> Found:
+    identify: Callable[[Sequence[FurtherMode], Selection | None], ModalFit],
+) -> ModalFit:
     """Return a model with the further modes that its records show.
 
     A missing mode distorts all other parameters, so a model of the selected kind is identified
@@ -115,7 +115,7 @@ def identify_records(request: FitRequest) -> Identification:
     """Fit a model to records, and evaluate it; raise DataError if they cannot be used."""
     records, validate = request.records, request.validate
 
-    def found(modes: Sequence[FurtherMode], selection: Selection | None) -> Found:
+    def found(modes: Sequence[FurtherMode], selection: Selection | None) -> ModalFit:
         asked = replace(request, modes=modes)
         if selection is None:
             selection = select(asked)
@@ -128,7 +128,7 @@ def identify_records(request: FitRequest) -> Identification:
         fit = fit_model(replace(chosen, start=held_out.end if held_out else None))
         if held_out is None and not validate:
             held_out = held_out_error(chosen)
-        return Found(fit, held_out, selection)
+        return ModalFit(fit, held_out, selection)
 
     best = with_modes(records, found)
     fit, held_out, selection = best.fit, best.held_out, best.selection

@@ -37,7 +37,7 @@ _HIGH = np.array([2.0, 200.0, 25.0, math.log(2.0)])
 
 
 @dataclass(frozen=True, slots=True)
-class Response:
+class IlcResponse:
     """``gain exp(-i w delay) / (1 - (w/w_n)^2 + 2 i zeta w/w_n)``.
 
     Attributes:
@@ -69,7 +69,7 @@ class Response:
 
 
 @dataclass(frozen=True, slots=True)
-class Change:
+class IlcChange:
     """A change of a correction, complex128[K + 1], its effect on the error, and its noise."""
 
     step_hz: float
@@ -90,7 +90,9 @@ class Change:
         return k.astype(np.float64) * self.step_hz, self.error_um[k] / self.correction_um[k], weight
 
 
-def fit(changes: Sequence[Change], first: tuple[float, complex], sample_rate_hz: float) -> Response:
+def fit(
+    changes: Sequence[IlcChange], first: tuple[float, complex], sample_rate_hz: float
+) -> IlcResponse:
     """Fit the response to all changes.
 
     Before the first change, the response to the reference gives an estimate of delay and resonance,
@@ -122,9 +124,9 @@ def fit(changes: Sequence[Change], first: tuple[float, complex], sample_rate_hz:
     return _response_at(best, highest, sample_rate_hz)
 
 
-def _response_at(x: F64, highest_hz: float, sample_rate_hz: float) -> Response:
+def _response_at(x: F64, highest_hz: float, sample_rate_hz: float) -> IlcResponse:
     slow = float(x[2]) / (2.0 * np.pi * highest_hz) ** 2
-    return Response(float(np.exp(x[0])), float(x[1]) / sample_rate_hz, slow, float(np.exp(x[3])))
+    return IlcResponse(float(np.exp(x[0])), float(x[1]) / sample_rate_hz, slow, float(np.exp(x[3])))
 
 
 FIRST_GAIN = 0.7
@@ -183,7 +185,7 @@ class IlcState:
     reach_hz: float = 0.0
     gain: float = FIRST_GAIN
     widening: float = _WIDEN
-    response: Response = field(default_factory=Response)
+    response: IlcResponse = field(default_factory=IlcResponse)
     trials: tuple[IlcIteration, ...] = ()
     done: str = ""
 
@@ -247,10 +249,10 @@ def _backed_off(state: IlcState, base: IlcIteration) -> IlcState:
     return replace(state, gain=gain, widening=widening, reach_hz=reach_hz)
 
 
-def _changes(state: IlcState) -> list[Change]:
+def _changes(state: IlcState) -> list[IlcChange]:
     """Return the changes from run to run."""
     return [
-        Change(
+        IlcChange(
             after.error.step_hz,
             after.correction_um - before.correction_um,
             after.error.harmonics_um - before.error.harmonics_um,
@@ -260,7 +262,7 @@ def _changes(state: IlcState) -> list[Change]:
     ]
 
 
-def _response(state: IlcState) -> Response:
+def _response(state: IlcState) -> IlcResponse:
     """Fit the response to all changes so far."""
     error = state.trials[0].error
     return fit(_changes(state), (error.strongest_hz, error.answer), state.sample_rate_hz)

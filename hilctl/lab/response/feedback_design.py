@@ -1,8 +1,7 @@
 """Feedback from a measured response: the largest integral gain with its margins, and the open loop.
 
 The response is from the compensator's input to the displacement. It may be measured in closed loop,
-because averaging over the periods of a multisine suppresses noise and drift, also those that the
-feedback returns.
+because averaging over the periods of a multisine suppresses noise and drift in the loop.
 """
 
 import math
@@ -164,7 +163,7 @@ def _kept(config: Experiment) -> dict[str, Any]:
     return {"limit_um": rounded_down(OFFSET_SHARE * (high_um - low_um))}
 
 
-def figure_rows(design: FeedbackDesign) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
+def margin_rows(design: FeedbackDesign) -> tuple[tuple[str, ...], list[tuple[str, ...]]]:
     """Return headings and rows of the margins of the proposed and the recorded loop."""
     rows: list[tuple[str, ...]] = [
         (
@@ -212,8 +211,8 @@ def open_loop_sheet(design: FeedbackDesign) -> FigureSpec:
 
 def write_design(design: FeedbackDesign, path: Path) -> None:
     """Write the page of a design; an existing file is replaced."""
-    (_, *headings), loops = figure_rows(design)
-    tables = [(name, zip(headings, figures, strict=True)) for name, *figures in loops]
+    (_, *headings), loops = margin_rows(design)
+    tables = [(name, zip(headings, margins, strict=True)) for name, *margins in loops]
     section = html.details("Proposed section of the experiment", design.to_yaml())
     body = [
         html.paragraph(str(design.path), "file"),

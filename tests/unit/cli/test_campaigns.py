@@ -13,7 +13,7 @@ from hilctl.lab.studies.campaign.plan import planned
 from hilctl.lab.studies.campaign.steps import CampaignStep, load_campaign
 from hilctl.lab.studies.campaign.store import CampaignRow
 from hilctl.lab.studies.learn import IlcResult, IlcRow
-from hilctl.lab.studies.multi_run.digest import RunFigures
+from hilctl.lab.studies.multi_run.digest import RunValues
 from hilctl.lab.studies.multi_run.varied_parameter import dimensions
 from tests.unit.lab.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 
@@ -103,7 +103,7 @@ def test_sweep_values(tmp_path):
 
 def test_row_prints_metrics_or_fault(capsys):
     step = CampaignStep(7, {"waveform.amplitude": 2.5}, 1, False, ())
-    figures = RunFigures(peak_to_peak_um=12.345, natural_hz=300.0)
+    figures = RunValues(peak_to_peak_um=12.345, natural_hz=300.0)
     varied = dimensions(["waveform.amplitude"], [step.point, {"waveform.amplitude": 5.0}])
     print_row(varied, step, CampaignRow("completed", figures, "a.mcap", "completed", kept=True))
     print_row(varied, step, CampaignRow("fault: late", code="fault"))
@@ -117,7 +117,7 @@ def test_result_prints_the_drift(words, tmp_path, capsys):
     with (tmp_path / "few.yaml").open("a") as file:
         file.write("reference_run: {every: 4}\n")
     plan = planned(load_campaign(tmp_path / "few.yaml"), tmp_path, {}, 0.0)
-    row = CampaignRow("completed", RunFigures(peak_to_peak_um=10.0), "a.mcap", "completed")
+    row = CampaignRow("completed", RunValues(peak_to_peak_um=10.0), "a.mcap", "completed")
     print_campaign(CampaignResult(plan, {1: row, 6: row}, (tmp_path / "few.csv",)))
     shown = capsys.readouterr().out
     assert "few: 2 completed, 4 planned" in shown

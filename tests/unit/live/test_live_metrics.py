@@ -34,7 +34,7 @@ def added(figures, samples, segment=SEGMENT, part=37):
 
 
 def test_figures_are_those_of_whole_cycles():
-    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(30, 1200)).newest
+    figures = added(live_metrics.RunningMetrics(RATE, "reference"), loop(30, 1200)).newest
     cycle = loop(30, 130).values
     expected = peak_hysteresis_percent(cycle[ROW["reference"]], cycle[ROW["displacement"]])
     assert figures["peak_hysteresis_percent"] == pytest.approx(expected, rel=1e-6)
@@ -46,7 +46,7 @@ def test_figures_are_those_of_whole_cycles():
 
 
 def test_metrics_are_of_the_newest_complete_cycles():
-    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(75, 2000, lag=0.4))
+    figures = added(live_metrics.RunningMetrics(RATE, "reference"), loop(75, 2000, lag=0.4))
     assert figures.newest["peak_error_um"] == pytest.approx(20 * np.sin(0.2), rel=1e-3)
     added(figures, loop(2000, 4000, lag=0.1))
     assert figures.newest["peak_error_um"] == pytest.approx(20 * np.sin(0.05), rel=1e-3)
@@ -55,7 +55,7 @@ def test_metrics_are_of_the_newest_complete_cycles():
 @pytest.mark.parametrize("period", [PERIOD, 0.0])
 def test_metrics_of_the_steady_part_stay_in_the_soft_end(period):
     ending = Segment("sine", 30, 1630, 30, 1230, period)
-    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(30, 1230), ending)
+    figures = added(live_metrics.RunningMetrics(RATE, "reference"), loop(30, 1230), ending)
     steady = figures.newest
     assert steady["peak_to_peak_um"] == pytest.approx(20.0, rel=1e-3)
     added(figures, loop(1230, 1630, lag=2.0), ending)
@@ -64,7 +64,7 @@ def test_metrics_of_the_steady_part_stay_in_the_soft_end(period):
 
 def test_metrics_of_a_steady_part_that_is_shorter_than_a_group():
     short = Segment("sine", 30, 400, 30, 260, PERIOD)
-    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(30, 400), short).newest
+    figures = added(live_metrics.RunningMetrics(RATE, "reference"), loop(30, 400), short).newest
     assert figures["peak_to_peak_um"] == pytest.approx(20.0, rel=1e-3)
 
 
@@ -73,19 +73,19 @@ def test_invalid_samples_are_omitted():
     samples.values[[ROW["displacement"], ROW["error"]], 300] = 1e6
     samples.flags[300] = int(Flag.SENSOR_INVALID)
     assert (
-        added(live_metrics.RunningFigures(RATE, "reference"), samples).newest["peak_error_um"] < 3.0
+        added(live_metrics.RunningMetrics(RATE, "reference"), samples).newest["peak_error_um"] < 3.0
     )
 
 
 def test_metrics_without_a_period():
     plain = Segment("steps", 0, 100_000, 0, 100_000)
-    figures = added(live_metrics.RunningFigures(RATE, "reference"), loop(0, 1200), plain).newest
+    figures = added(live_metrics.RunningMetrics(RATE, "reference"), loop(0, 1200), plain).newest
     assert figures["peak_error_um"] == pytest.approx(20 * np.sin(0.1), rel=1e-3)
     assert "peak_hysteresis_percent" not in figures
 
 
 def test_no_metrics_before_the_first_complete_cycle():
-    figures = live_metrics.RunningFigures(RATE, "reference")
+    figures = live_metrics.RunningMetrics(RATE, "reference")
     assert added(figures, loop(30, 90)).newest == {}
     assert added(figures, loop(90, 200), None).newest == {}
 

@@ -26,7 +26,7 @@ from hilctl.lab.studies.multi_run.collect import (
     STEP,
     SeriesRun,
 )
-from hilctl.lab.studies.multi_run.digest import FIGURES, RunDigest, RunFigures
+from hilctl.lab.studies.multi_run.digest import FIGURES, RunDigest, RunValues
 from hilctl.lab.studies.multi_run.varied_parameter import short_value
 
 
@@ -47,7 +47,7 @@ class CampaignRow:
     """Outcome of a step."""
 
     result: str = PLANNED  # ``planned``, ``completed``, or code and reason
-    figures: RunFigures = field(default_factory=RunFigures)
+    figures: RunValues = field(default_factory=RunValues)
     recording: str = ""  # name of its recording in the campaign's folder, or empty
     code: str = PLANNED  # ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``
     kept: bool = False  # whether it was done already

@@ -152,7 +152,7 @@ _SHAPE_HARMONICS = 12
 
 
 @dataclass(frozen=True, slots=True)
-class LoopFigures:
+class LoopMetrics:
     """One steady loop."""
 
     label: str  # label of the segment
@@ -177,7 +177,7 @@ class LoopFigures:
         return 0.5 * self.peak_to_peak_um / self.amplitude
 
 
-def loop_figures(recording: Recording, segment: Segment) -> LoopFigures:
+def loop_metrics(recording: Recording, segment: Segment) -> LoopMetrics:
     """Evaluate the steady cycles of a segment; raise DataError without a whole one."""
     part = steady_part(recording, segment)
     if part.cycle is None:
@@ -195,7 +195,7 @@ def loop_figures(recording: Recording, segment: Segment) -> LoopFigures:
     cycle_of = (np.arange(average.size) * count) // average.size
     off = part.samples.displacement_um - average
     means = np.bincount(cycle_of, off) / np.bincount(cycle_of)
-    return LoopFigures(
+    return LoopMetrics(
         label=segment.label,
         amplitude=0.5 * float(np.ptp(command)),
         bias=0.5 * float(command.max() + command.min()),
@@ -209,7 +209,7 @@ def loop_figures(recording: Recording, segment: Segment) -> LoopFigures:
     )
 
 
-def centre_line(loop: LoopFigures) -> F64:
+def centre_line(loop: LoopMetrics) -> F64:
     """Return the mean command of both branches at even steps of the displacement: float64[k]."""
     first = int(loop.displacement_um.argmin())
     command, y = np.roll(loop.command, -first), np.roll(loop.displacement_um, -first)
@@ -222,9 +222,9 @@ def centre_line(loop: LoopFigures) -> F64:
     return np.asarray(0.5 * (rising + falling))
 
 
-def all_loops(recording: Recording) -> tuple[LoopFigures, ...]:
+def all_loops(recording: Recording) -> tuple[LoopMetrics, ...]:
     """Evaluate every periodic segment."""
-    return tuple(loop_figures(recording, each) for each in recording.segments if each.period > 0.0)
+    return tuple(loop_metrics(recording, each) for each in recording.segments if each.period > 0.0)
 
 
 def _refuse_saturated(displacement_um: F64, label: str) -> None:
@@ -242,7 +242,7 @@ def _refuse_saturated(displacement_um: F64, label: str) -> None:
 
 
 def next_amplitude(
-    loops: Sequence[LoopFigures], wanted: float, stroke_um: tuple[float, float]
+    loops: Sequence[LoopMetrics], wanted: float, stroke_um: tuple[float, float]
 ) -> float | None:
     """Return the wanted amplitude, lowered to the stroke; None if it is hardly a change."""
     # Displacement grows faster than the command: the last two loops give the exponent.
@@ -275,7 +275,7 @@ class Repeatability:
     shift_percent: float  # the same, of the peak-to-peak
 
 
-def repeatability(first: LoopFigures, again: LoopFigures) -> Repeatability:
+def repeatability(first: LoopMetrics, again: LoopMetrics) -> Repeatability:
     """Compare two measurements of one loop."""
     phase = np.linspace(0.0, 1.0, _POINTS, endpoint=False)
     one, two = (

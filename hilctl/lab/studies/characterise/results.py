@@ -26,7 +26,7 @@ from hilctl.lab.identify.pipeline import (
 from hilctl.lab.response.frequency_response import FrequencyResponse
 from hilctl.lab.response.segment_spectrum import RestNoise
 from hilctl.lab.studies.characterise.measurements import (
-    LoopFigures,
+    LoopMetrics,
     Repeatability,
     ReversalCurves,
     StepResponseCheck,
@@ -44,11 +44,11 @@ class Measured:
     rest: RestNoise | None = None
     reaction: StepResponseCheck | None = None  # first reaction and its polarity
     small: FrequencyResponse | None = None  # small-signal response
-    growing: tuple[LoopFigures, ...] = ()  # loops of growing amplitude
-    slow: tuple[LoopFigures, ...] = ()  # loops at the lowest frequency
-    fast: tuple[LoopFigures, ...] = ()  # loops at several frequencies
+    growing: tuple[LoopMetrics, ...] = ()  # loops of growing amplitude
+    slow: tuple[LoopMetrics, ...] = ()  # loops at the lowest frequency
+    fast: tuple[LoopMetrics, ...] = ()  # loops at several frequencies
     reversal: ReversalCurves | None = None
-    biased: tuple[LoopFigures, ...] = ()  # small loops over the whole range
+    biased: tuple[LoopMetrics, ...] = ()  # small loops over the whole range
     crept_percent: tuple[float, ...] = ()  # creep in each hold, of the motion to it
     repeated: Repeatability | None = None  # change of the largest growing loop at the end
 

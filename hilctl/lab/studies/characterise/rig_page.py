@@ -24,7 +24,7 @@ from hilctl.lab.pages.plot_style import (
     min_max,
 )
 from hilctl.lab.response.bode import response_sheet
-from hilctl.lab.studies.characterise.measurements import LoopFigures, ReversalCurves
+from hilctl.lab.studies.characterise.measurements import LoopMetrics, ReversalCurves
 from hilctl.lab.studies.characterise.results import Characterisation, Measured, ValidationReference
 from hilctl.lab.studies.characterise.waveforms import CREEP_S
 from hilctl.models.model_file import dump_model
@@ -34,7 +34,7 @@ _CLOSE = 0.02  # of the duration, to either side
 _SQUARE = 0.85
 
 
-def loops_sheet(caption: str, loops: Sequence[LoopFigures], unit: str) -> FigureSpec:
+def loops_sheet(caption: str, loops: Sequence[LoopMetrics], unit: str) -> FigureSpec:
     """Return displacement against command of several loops."""
 
     def draw(axes: Axes) -> None:
@@ -112,7 +112,7 @@ def held_out_rows(found: Characterisation) -> list[tuple[str, ...]]:
     ]
 
 
-def figure_rows(found: Characterisation) -> Iterator[tuple[str, str]]:
+def value_rows(found: Characterisation) -> Iterator[tuple[str, str]]:
     """Yield the measured quantities, each as name and text."""
     yield from _measured_rows(found.measured, found.unit)
     model = None if found.identification is None else found.identification.fit.model
@@ -168,7 +168,7 @@ def characterisation_page(found: Characterisation) -> str:
         html.paragraph(found.problem, "note") if found.problem else "",
         *_held_out(found),
         "<h2>Measured</h2>",
-        html.grid(("quantity", "value"), figure_rows(found)),
+        html.grid(("quantity", "value"), value_rows(found)),
         html.figures(_sheets(found)),
         *_model(found),
         "<h2>Steps</h2>",

@@ -15,7 +15,7 @@ from hilctl.lab.studies.characterise.measurements import (
     all_loops,
     centre_line,
     crept_percent,
-    loop_figures,
+    loop_metrics,
     next_amplitude,
     noise_at_rest,
     repeatability,
@@ -178,7 +178,7 @@ def _middle_loop(limits: Limits, amplitude: float) -> Keys:
 
 
 def _take_growing(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    found = loop_figures(recording, recording.segments[-1])
+    found = loop_metrics(recording, recording.segments[-1])
     loop = f"{found.amplitude:.3g} {limits.unit} moves {found.peak_to_peak_um:.3g} µm"
     if found.scatter_percent > _MOST_SCATTER_PERCENT:
         _refuse_unrepeatable(f"cycles of {loop} differ by {found.scatter_percent:.2g} % rms")
@@ -255,7 +255,7 @@ def _take_creep(recording: Recording, limits: Limits, measured: Measured) -> Eva
 
 
 def _take_again(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
-    again = loop_figures(recording, recording.segments[-1])
+    again = loop_metrics(recording, recording.segments[-1])
     found = repeatability(measured.growing[-1], again)
     shape, shift = f"{found.shape_percent:.2g} % in shape", f"{found.shift_percent:.2g} % in offset"
     if math.hypot(found.shape_percent, found.shift_percent) > _MOST_SCATTER_PERCENT:

@@ -15,7 +15,7 @@ from hilctl.base.files import is_file, is_folder, read_text
 from hilctl.lab.studies.multi_run.digest import (
     FIGURES,
     RunDigest,
-    RunFigures,
+    RunValues,
     SeriesDrift,
     digest_of,
     drift_of,
@@ -48,7 +48,7 @@ class SeriesRun:
     number: int  # its position, from 1
     is_reference: bool  # whether it is a reference run of a campaign
     values: Mapping[str, Hashable]  # value of each varied key, as a number or short text
-    figures: RunFigures
+    figures: RunValues
     result: str  # ``completed``, ``planned``, or code and reason
     recording: str  # name of its recording, or empty
     digest: RunDigest | None = None
@@ -98,7 +98,7 @@ def _entry(row: Mapping[str, str], keys: list[str]) -> SeriesRun:
         number=int(row[STEP]),
         is_reference={"True": True, "False": False}[row[REFERENCE]],
         values={key: short_value(plain_value(row[key])) for key in keys},
-        figures=RunFigures(**{name: _number(name, row.get(name, "")) for name in FIGURES}),
+        figures=RunValues(**{name: _number(name, row.get(name, "")) for name in FIGURES}),
         result=row[RESULT],
         recording=row[RECORDING],
         repeat=int(row[REPEAT]),

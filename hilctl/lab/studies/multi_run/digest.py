@@ -25,7 +25,7 @@ from hilctl.recording.recording import Recording
 
 
 @dataclass(frozen=True, slots=True)
-class RunFigures:
+class RunValues:
     """Metrics of one run; None for those that do not apply.
 
     Attributes:
@@ -62,25 +62,25 @@ class RunFigures:
     heat_after_a: float | None = None
 
 
-FIGURES = tuple(field.name for field in fields(RunFigures))
+FIGURES = tuple(field.name for field in fields(RunValues))
 
 
-def _figures(
+def _metrics(
     recording: Recording,
     report: RunReport,
     worst: Segment | None,
     structure: FrequencyResponse | StepResponse | None,
-) -> RunFigures:
+) -> RunValues:
     measured = [
         event.values.get("offset_um") for event in recording.events if event.code in (OFFSET, ZERO)
     ]
-    return RunFigures(
+    return RunValues(
         peak_hysteresis_percent=report.peak_hysteresis_percent,
         peak_error_percent=report.peak_error_percent,
         rms_error_percent=report.rms_error_percent,
         loop_area=report.loop_area,
         peak_to_peak_um=report.peak_to_peak_um,
-        **(_cycle_figures(recording, worst) if worst else {}),
+        **(_cycle_metrics(recording, worst) if worst else {}),
         offset_um=measured[0] if measured else None,
         natural_hz=structure.natural_hz if structure else None,
         damping_ratio=structure.damping_ratio if structure else None,
@@ -94,7 +94,7 @@ def _rms_a(heat: str | None) -> float | None:
     return None if heat is None else float(np.sqrt(float(heat)))
 
 
-def _cycle_figures(recording: Recording, segment: Segment) -> dict[str, float]:
+def _cycle_metrics(recording: Recording, segment: Segment) -> dict[str, float]:
     part = steady_part(recording, segment)
     if part.cycle is None or not part.loop.size:
         return {}
@@ -136,7 +136,7 @@ class SeriesDrift:
         return f"drift over {self.runs} reference runs: {known or 'no metrics'}"
 
 
-def drift_of(done: Sequence[RunFigures]) -> SeriesDrift | None:
+def drift_of(done: Sequence[RunValues]) -> SeriesDrift | None:
     """Return the drift of completed reference runs in order; None with fewer than two."""
     if len(done) < 2:
         return None
@@ -173,7 +173,7 @@ class RunDigest:
     compensated: bool
     command_unit: str
     waveform: str  # label of the evaluated segment
-    figures: RunFigures
+    figures: RunValues
     # float64[2, m], input and displacement, closed; empty without a cycle
     loop: F64 = field(default_factory=_NO_LOOP.copy)
     # float64[3, m], command, measured and modelled um over a cycle, or empty
@@ -205,7 +205,7 @@ def digest_of(recording: Recording, model: HysteresisModel | None = None) -> Run
         compensated=recording.compensated,
         command_unit=recording.command_unit,
         waveform=worst.label if worst else "",
-        figures=_figures(recording, report, worst, structure),
+        figures=_metrics(recording, report, worst, structure),
         **(_loop(recording, worst, model) if worst and worst.is_loop else {}),
     )
 

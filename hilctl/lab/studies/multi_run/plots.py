@@ -32,7 +32,7 @@ from hilctl.lab.studies.multi_run.trend import (
     PEAK_ERROR,
     RMS_ERROR,
     STROKE,
-    RunFigure,
+    SeriesMetric,
     Trend,
     axis_name,
     trends,
@@ -75,7 +75,7 @@ def trend_sheets(series: RunSeries) -> Iterator[FigureSpec]:
 def _trend_panels(
     series: RunSeries,
     along: VariedParameter,
-    figures: Sequence[RunFigure],
+    figures: Sequence[SeriesMetric],
     runs: Sequence[SeriesRun] | None,
     *,
     fitted: bool = False,

@@ -17,7 +17,7 @@ _FEWEST = 3
 
 
 @dataclass(frozen=True, slots=True)
-class RunFigure:
+class SeriesMetric:
     """A metric to compare among runs."""
 
     name: str  # its column in the table
@@ -32,8 +32,8 @@ class RunFigure:
         return [(run, value) for run, value in found if value is not None]
 
 
-def _column(name: str, text: str, unit: str, short: str) -> RunFigure:
-    return RunFigure(name, text, unit, short, lambda run: getattr(run.figures, name))
+def _column(name: str, text: str, unit: str, short: str) -> SeriesMetric:
+    return SeriesMetric(name, text, unit, short, lambda run: getattr(run.figures, name))
 
 
 STROKE = _column("peak_to_peak_um", "peak-to-peak", "um", "p-p µm")
@@ -43,7 +43,7 @@ PEAK_ERROR = _column("peak_error_percent", "peak error", "%", "error %")
 RMS_ERROR = _column("rms_error_percent", "rms error", "%", "rms %")
 NATURAL = _column("natural_hz", "natural frequency", "Hz", "reson. Hz")
 DAMPING = _column("damping_ratio", "damping ratio", "", "damping")
-MODEL_ERROR = RunFigure(
+MODEL_ERROR = SeriesMetric(
     "model_error_percent",
     "model error",
     "%",
@@ -59,7 +59,7 @@ def _asymmetry(run: SeriesRun) -> float | None:
     return 100.0 * abs(high + low) / stroke
 
 
-def axis_name(series: RunSeries, figure: RunFigure) -> str:
+def axis_name(series: RunSeries, figure: SeriesMetric) -> str:
     """Return the name of a metric with its unit; the unit of areas depends on the runs."""
     unit = unit_text(figure.unit)
     if figure is AREA:
@@ -68,7 +68,7 @@ def axis_name(series: RunSeries, figure: RunFigure) -> str:
     return f"{figure.text}, {unit}" if unit else figure.text
 
 
-ASYMMETRY = RunFigure("asymmetry_percent", "asymmetry", "%", "asym. %", _asymmetry)
+ASYMMETRY = SeriesMetric("asymmetry_percent", "asymmetry", "%", "asym. %", _asymmetry)
 """Difference of the two peaks, of the peak-to-peak."""
 
 
@@ -76,7 +76,7 @@ ASYMMETRY = RunFigure("asymmetry_percent", "asymmetry", "%", "asym. %", _asymmet
 class Trend:
     """A metric against one varied parameter, with the others constant."""
 
-    figure: RunFigure
+    figure: SeriesMetric
     along: VariedParameter
     held: Mapping[str, Hashable]  # value of each other parameter, by its key
     x: F64  # float64[n], values of ``along``, ascending
@@ -113,7 +113,7 @@ class Trend:
 
 def trends(
     series: RunSeries,
-    figure: RunFigure,
+    figure: SeriesMetric,
     along: VariedParameter,
     runs: Sequence[SeriesRun] | None = None,
 ) -> list[Trend]:
@@ -136,7 +136,7 @@ def trends(
 
 
 def _trend(
-    figure: RunFigure,
+    figure: SeriesMetric,
     along: VariedParameter,
     held: Mapping[str, Hashable],
     points: Mapping[float, list[float]],

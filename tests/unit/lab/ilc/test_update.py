@@ -4,20 +4,20 @@ import numpy as np
 import pytest
 
 from hilctl.lab.ilc.cycle import CycleScore
-from hilctl.lab.ilc.update import FIRST_GAIN, Change, IlcState, Response, fit, learn, refused
+from hilctl.lab.ilc.update import FIRST_GAIN, IlcChange, IlcResponse, IlcState, fit, learn, refused
 
 RATE_HZ = 50_000.0
 STEP_HZ = 100.0
 HARMONICS = 60
 FREQUENCY = np.arange(HARMONICS + 1) * STEP_HZ
 NOISE_UM = 2e-4
-RESONANT = Response(1.0, 2.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 2300.0) ** 2, 0.12)
+RESONANT = IlcResponse(1.0, 2.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 2300.0) ** 2, 0.12)
 
 
 class Plant:
     """Answers a correction harmonic by harmonic, with some of it in the neighbours."""
 
-    def __init__(self, response: Response, coupling: float = 0.0, seed: int = 1) -> None:
+    def __init__(self, response: IlcResponse, coupling: float = 0.0, seed: int = 1) -> None:
         self._random = np.random.default_rng(seed)
         decay = np.maximum(1.0, np.arange(HARMONICS + 1)) ** -2.0
         phase = np.exp(2j * np.pi * self._random.random(HARMONICS + 1))
@@ -68,11 +68,11 @@ def peaks(state: IlcState) -> list[float]:
 
 
 @pytest.mark.parametrize("response", [
-    pytest.param(Response(), id="exact", marks=pytest.mark.slow),
-    pytest.param(Response(0.8, 5.0 / RATE_HZ), id="late", marks=pytest.mark.slow),
+    pytest.param(IlcResponse(), id="exact", marks=pytest.mark.slow),
+    pytest.param(IlcResponse(0.8, 5.0 / RATE_HZ), id="late", marks=pytest.mark.slow),
     pytest.param(RESONANT, id="resonant"),
-    pytest.param(Response(1.1, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 480.0) ** 2, 0.12), id="loaded",
-        marks=pytest.mark.slow),
+    pytest.param(IlcResponse(1.1, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 480.0) ** 2, 0.12),
+        id="loaded", marks=pytest.mark.slow),
 ])  # fmt: skip
 @pytest.mark.parametrize(
     "coupling", [pytest.param(0.0, marks=[pytest.mark.slow, pytest.mark.long]), 0.15]
@@ -88,21 +88,21 @@ def test_the_error_goes_to_the_noise_floor(response, coupling):
 def test_a_resonance_that_the_fit_lacks_is_learned():
     """The fit has one resonance. The plant has another, on a harmonic, with a gain of 5."""
     plant = Plant(RESONANT, 0.15)
-    second = Response(0.1, 2.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 1500.0) ** 2, 0.01)
+    second = IlcResponse(0.1, 2.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 1500.0) ** 2, 0.01)
     plant._answer = 0.9 * plant._answer + second.at(FREQUENCY)
     assert "noise floor" in learned(plant).done
 
 
 @pytest.mark.slow
 def test_it_stops_at_the_noise_floor():
-    state = learned(Plant(Response()))
+    state = learned(Plant(IlcResponse()))
     assert "noise floor" in state.done
     assert state.best.error.peak_um <= 1.2 * state.best.error.floor_um
     assert len(state.trials) < 15
 
 
 def test_noise_alone_is_not_learned():
-    plant = Plant(Response())
+    plant = Plant(IlcResponse())
     plant._start[:] = 0.0
     state = learn(begun(), plant.run(begun().next_um))
     assert np.abs(state.next_um).max() < NOISE_UM
@@ -111,14 +111,14 @@ def test_noise_alone_is_not_learned():
 def test_the_first_step_reaches_no_further_than_the_phase_is_known():
     """30 degrees of what the first answer says: 50 samples late is 30 degrees at 83 Hz."""
     quick, late = begun(), begun()
-    quick = learn(quick, Plant(Response()).run(quick.next_um))
-    late = learn(late, Plant(Response(1.0, 50.0 / RATE_HZ)).run(late.next_um))
+    quick = learn(quick, Plant(IlcResponse()).run(quick.next_um))
+    late = learn(late, Plant(IlcResponse(1.0, 50.0 / RATE_HZ)).run(late.next_um))
     assert quick.reach_hz == pytest.approx(500.0)
     assert late.reach_hz == pytest.approx(STEP_HZ)
 
 
 def test_the_reach_grows_while_the_error_falls():
-    plant = Plant(Response())
+    plant = Plant(IlcResponse())
     state = learn(begun(), plant.run(begun().next_um))
     beyond = 1.25 * state.reach_hz < FREQUENCY
     assert not state.next_um[beyond].any()
@@ -128,7 +128,7 @@ def test_the_reach_grows_while_the_error_falls():
 
 @pytest.mark.slow
 def test_it_backs_off_to_the_best_where_the_error_grows():
-    plant = Plant(Response())
+    plant = Plant(IlcResponse())
     state = learn(begun(), plant.run(begun().next_um))
     state = learn(state, plant.run(state.next_um))
     best = state.best
@@ -145,7 +145,7 @@ def test_a_plant_that_turns_the_wrong_way_does_not_run_away():
 
     It ends with a correction no worse than none.
     """
-    plant = Plant(Response())
+    plant = Plant(IlcResponse())
     plant._answer = np.where(FREQUENCY > 1000.0, -1.0, 1.0) * plant._answer
     state = learned(plant)
     assert max(peaks(state)) < 1.2 * peaks(state)[0]
@@ -153,7 +153,7 @@ def test_a_plant_that_turns_the_wrong_way_does_not_run_away():
 
 
 def test_a_refused_correction_is_tried_again_with_less():
-    state = learn(begun(), Plant(Response()).run(begun().next_um))
+    state = learn(begun(), Plant(IlcResponse()).run(begun().next_um))
     smaller = refused(state)
     assert smaller.gain == pytest.approx(0.5 * FIRST_GAIN)
     assert smaller.reach_hz < state.reach_hz
@@ -162,7 +162,7 @@ def test_a_refused_correction_is_tried_again_with_less():
 
 
 def test_learning_ends_at_a_limit():
-    state = learn(begun(), Plant(Response()).run(begun().next_um))
+    state = learn(begun(), Plant(IlcResponse()).run(begun().next_um))
     for _ in range(10):
         state = refused(state)
     assert state.done == "at a limit"
@@ -170,23 +170,25 @@ def test_learning_ends_at_a_limit():
 
 
 def test_it_gives_up_where_nothing_helps():
-    plant = Plant(Response())
+    plant = Plant(IlcResponse())
     plant._answer = 0.0 * plant._answer
     state = learned(plant)
     assert "5 runs" in state.done
     assert len(state.trials) == 6
 
 
-PLANT = Response(1.05, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 1500.0) ** 2, 0.12)
+PLANT = IlcResponse(1.05, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 1500.0) ** 2, 0.12)
 
 
-def change(plant: Response, reach_hz: float, size_um: float, noise_um: float, seed: int) -> Change:
+def change(
+    plant: IlcResponse, reach_hz: float, size_um: float, noise_um: float, seed: int
+) -> IlcChange:
     """Every harmonic up to a reach moved by a random phase, and what a plant makes of it."""
     random = np.random.default_rng(seed)
     frequency = np.arange(60) * STEP_HZ
     moved = size_um * np.exp(2j * np.pi * random.random(60)) * (frequency <= reach_hz)
     noise = noise_um * (random.standard_normal(60) + 1j * random.standard_normal(60)) / np.sqrt(2)
-    return Change(STEP_HZ, moved, plant.at(frequency) * moved + noise, np.full(60, noise_um))
+    return IlcChange(STEP_HZ, moved, plant.at(frequency) * moved + noise, np.full(60, noise_um))
 
 
 def test_nothing_but_the_first_answer_gives_delay_and_gain_near_what_is_usual():
@@ -233,10 +235,10 @@ def test_a_strong_neighbour_is_not_taken_for_an_answer():
     moved[1], moved[2] = 1.0, 0.01
     answer = moved.copy()
     answer[2] = 0.1j
-    frequency, _, _ = Change(STEP_HZ, moved, answer, np.full(12, 1e-4)).points()
+    frequency, _, _ = IlcChange(STEP_HZ, moved, answer, np.full(12, 1e-4)).points()
     assert frequency.tolist() == [100.0]
 
 
 def test_no_resonance_has_no_natural_frequency():
-    assert Response().natural_hz is None
+    assert IlcResponse().natural_hz is None
     assert PLANT.natural_hz == pytest.approx(1500.0)

@@ -10,7 +10,7 @@ from hilctl.base.errors import ConfigError, InputError
 from hilctl.lab.studies.campaign import store
 from hilctl.lab.studies.campaign.plan import planned
 from hilctl.lab.studies.campaign.store import CampaignRow, write_table
-from hilctl.lab.studies.multi_run.digest import FIGURES, RunFigures
+from hilctl.lab.studies.multi_run.digest import FIGURES, RunValues
 from tests.unit.lab.studies.campaign.conftest import CAMPAIGN
 
 
@@ -28,7 +28,7 @@ def test_default_folder(campaign):
         store.campaign_folder(few)
 
 
-DONE = CampaignRow("completed", RunFigures(peak_to_peak_um=0.1 + 0.2), "few-0001.mcap", "completed")
+DONE = CampaignRow("completed", RunValues(peak_to_peak_um=0.1 + 0.2), "few-0001.mcap", "completed")
 
 
 @pytest.fixture

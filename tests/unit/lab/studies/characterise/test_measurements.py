@@ -10,12 +10,12 @@ from scipy.signal import cont2discrete, lfilter
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
 from hilctl.lab.studies.characterise.measurements import (
-    LoopFigures,
+    LoopMetrics,
     RigProblemError,
     all_loops,
     centre_line,
     crept_percent,
-    loop_figures,
+    loop_metrics,
     next_amplitude,
     noise_at_rest,
     repeatability,
@@ -179,7 +179,7 @@ def test_a_few_readings_that_are_no_numbers_do_no_harm_many_do(limits, played):
 
 def loop(limits, played, actuator=plays, amplitude=2.0, noise_um=0.01):
     run = played(limits, sine(limits, amplitude, limits.middle_hz, 8.0), actuator, noise_um)
-    return loop_figures(run, run.segments[-1])
+    return loop_metrics(run, run.segments[-1])
 
 
 def test_figures_of_a_loop(limits, played):
@@ -222,7 +222,7 @@ def test_a_segment_without_a_cycle_has_no_loop(make_recording):
     run = make_recording(np.zeros(100), segments=[Segment("chirp", 0, 100, 0, 100)])
     assert all_loops(run) == ()
     with pytest.raises(DataError, match="steady cycle"):
-        loop_figures(run, run.segments[0])
+        loop_metrics(run, run.segments[0])
 
 
 def test_small_loops_have_their_places(limits, played):
@@ -232,7 +232,7 @@ def test_small_loops_have_their_places(limits, played):
     assert all(each.amplitude == pytest.approx(0.45, rel=1e-2) for each in found)
 
 
-LOOP = LoopFigures("x", 1.0, 0.0, 5.0, -5.0, 5.0, 10.0, 0.0, np.zeros(4), np.zeros(4))
+LOOP = LoopMetrics("x", 1.0, 0.0, 5.0, -5.0, 5.0, 10.0, 0.0, np.zeros(4), np.zeros(4))
 
 
 def grown(*sizes):

@@ -16,7 +16,7 @@ from hilctl.lab.identify.pipeline import identify_records
 from hilctl.lab.identify.settings import FitSettings
 from hilctl.lab.response.segment_spectrum import rest_noise
 from hilctl.lab.studies.characterise import results
-from hilctl.lab.studies.characterise.measurements import LoopFigures, ReversalCurves
+from hilctl.lab.studies.characterise.measurements import LoopMetrics, ReversalCurves
 from hilctl.lab.studies.characterise.results import (
     FITTED,
     VALIDATED,
@@ -36,7 +36,7 @@ MODE = FurtherMode(
     natural_hz=900.0, damping_ratio=0.02, antiresonance_hz=800.0, antiresonance_damping_ratio=0.02
 )
 UNSEEN = ValidationReference("random reference", 1.5, 0.4, 0.1, 0.2, *[NOTHING] * 4)
-LOOP = LoopFigures("sine", 1.0, 0.0, 5.0, -5.0, 5.0, None, 0.0, NOTHING, NOTHING)
+LOOP = LoopMetrics("sine", 1.0, 0.0, 5.0, -5.0, 5.0, None, 0.0, NOTHING, NOTHING)
 FOUND = Characterisation(
     experiment="rig", device="a device", unit="A", band_hz=(1.0, 400.0),
     steps=(StepRow("rest", "noise", 2.0, 0.1),),

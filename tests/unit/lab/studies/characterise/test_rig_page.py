@@ -88,9 +88,9 @@ def test_the_problem_is_at_the_top():
 
 
 def test_creep_is_a_figure_where_it_was_looked_for():
-    rows = dict(rig_page.figure_rows(replace(FOUND, measured=Measured(crept_percent=(2.44, -3.1)))))
+    rows = dict(rig_page.value_rows(replace(FOUND, measured=Measured(crept_percent=(2.44, -3.1)))))
     assert rows["creep in holds"] == "+2.4 % and -3.1 % in 4 s"
-    assert "creep in holds" not in dict(rig_page.figure_rows(replace(FOUND, measured=Measured())))
+    assert "creep in holds" not in dict(rig_page.value_rows(replace(FOUND, measured=Measured())))
 
 
 def test_further_modes_of_the_model_are_figures():
@@ -99,10 +99,10 @@ def test_further_modes_of_the_model_are_figures():
         antiresonance_damping_ratio=0.02,
     )  # fmt: skip
     known = identification()
-    plain = dict(rig_page.figure_rows(replace(FOUND, identification=known)))
+    plain = dict(rig_page.value_rows(replace(FOUND, identification=known)))
     assert "further mode of the model" not in plain
     model = StagedModel.around(piezo_ppi(), modes=(mode,))
     ringing = replace(known, fit=replace(known.fit, model=model))
-    rows = dict(rig_page.figure_rows(replace(FOUND, identification=ringing)))
+    rows = dict(rig_page.value_rows(replace(FOUND, identification=ringing)))
     row = rows["further mode of the model"]
     assert all(value in row for value in ("602.0 Hz", "0.024", "633.0 Hz"))

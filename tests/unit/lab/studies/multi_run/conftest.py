@@ -9,7 +9,7 @@ import pytest
 from matplotlib.figure import Figure
 
 from hilctl.lab.studies.multi_run.collect import RunSeries, SeriesRun
-from hilctl.lab.studies.multi_run.digest import RunDigest, RunFigures
+from hilctl.lab.studies.multi_run.digest import RunDigest, RunValues
 
 PHASE = np.linspace(0.0, 2.0 * np.pi, 101)
 
@@ -28,14 +28,14 @@ def digest(*, compensated: bool = False, lag: float = 0.2, **keys: Any) -> RunDi
         name="rig", path="run.mcap", started="2026-11-22T10:00:00+00:00", labels={},
         device="serial_dac", simulated=False, code="completed", reason="waveform completed",
         values={"waveform": {"unit": "A"}}, compensated=compensated, command_unit="A",
-        waveform="sine", figures=RunFigures(), loop=np.array((wave, moved)),
+        waveform="sine", figures=RunValues(), loop=np.array((wave, moved)),
     )  # fmt: skip
     return replace(made, **keys)
 
 
 def grown(amplitude: float, hz: float, number: int = 1, **keys: Any) -> SeriesRun:
     """Return a run whose area is linear in frequency and whose stroke is in amplitude."""
-    figures = RunFigures(
+    figures = RunValues(
         peak_to_peak_um=10.0 * amplitude,
         loop_area=amplitude * (20.0 + 0.5 * hz),
         peak_hysteresis_percent=10.0 + 0.1 * hz,
@@ -61,7 +61,7 @@ def compensated() -> RunSeries:
     runs = []
     for name, percent in (("none", 20.0), ("omega", 2.0)):
         for hz in (1.0, 100.0):
-            figures = RunFigures(
+            figures = RunValues(
                 peak_hysteresis_percent=percent + 0.01 * hz,
                 peak_error_percent=None if name == "none" else 1.0,
                 peak_to_peak_um=80.0,

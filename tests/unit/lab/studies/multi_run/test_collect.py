@@ -11,11 +11,11 @@ from hilctl.lab.studies.campaign.steps import CampaignStep
 from hilctl.lab.studies.campaign.store import CampaignRow, columns_of, csv_text, entry_of
 from hilctl.lab.studies.multi_run import collect as module
 from hilctl.lab.studies.multi_run.collect import collect, find_table, read_entries
-from hilctl.lab.studies.multi_run.digest import RunFigures
+from hilctl.lab.studies.multi_run.digest import RunValues
 
 POINT = {"waveform.amplitude": 0.1 + 0.2, "compensator": {"model": "a,b.yaml"}, "note": 'say "x"\n'}
 DONE = CampaignRow(
-    "completed", RunFigures(loop_area=1.0 / 3.0, deadline_misses=2), "few-0002.mcap", "completed"
+    "completed", RunValues(loop_area=1.0 / 3.0, deadline_misses=2), "few-0002.mcap", "completed"
 )
 
 
@@ -105,7 +105,7 @@ def test_a_folder_without_a_table_gives_all_that_can_be_read(folder):
 
 
 def test_a_campaign_s_table_says_what_varied_and_what_failed(folder):
-    figures = RunFigures(peak_hysteresis_percent=20.0)
+    figures = RunValues(peak_hysteresis_percent=20.0)
     steps = [CampaignStep(n, {"waveform.amplitude": float(n)}, 1, False, ()) for n in (1, 2, 3)]
     name = "terfenol_uncompensated.mcap"
     rows = [

@@ -75,7 +75,7 @@ def test_a_step_s_ringing(figures):
 
 
 def reference(peak_to_peak_um, mean_um):
-    return digest.RunFigures(
+    return digest.RunValues(
         peak_to_peak_um=peak_to_peak_um, mean_um=mean_um, peak_hysteresis_percent=10.0
     )
 

@@ -7,7 +7,7 @@ import pytest
 from hilctl.base.errors import InputError
 from hilctl.lab.studies.multi_run import plots
 from hilctl.lab.studies.multi_run.collect import RunSeries
-from hilctl.lab.studies.multi_run.digest import RunFigures
+from hilctl.lab.studies.multi_run.digest import RunValues
 from tests.unit.lab.studies.multi_run.conftest import drawn, grown
 
 
@@ -49,7 +49,7 @@ def test_they_are_found_from_what_varied(crossed, compensated):
 def test_resonances_of_steps_and_multisines():
     runs = []
     for number, natural_hz in enumerate((2300.0, 470.0), 1):
-        figures = RunFigures(natural_hz=natural_hz, damping_ratio=0.12)
+        figures = RunValues(natural_hz=natural_hz, damping_ratio=0.12)
         values = {"device.load_kg": 3.7 * number}
         runs.append(grown(1.0, 1.0, number, figures=figures, values=values, digest=None))
     series = RunSeries("loads", tuple(runs), ("device.load_kg",), is_campaign=True)
