@@ -4,4 +4,4 @@ PUBLIC = (
     "catalogue", "contour", "export", "export_files", "replay", "report", "run_metrics",
     "steady_state", "tick_lateness",
 )  # fmt: skip
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

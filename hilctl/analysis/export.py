@@ -176,8 +176,8 @@ def export_all(
 
     The files form one Hive-style data set with the same columns in all files. A column that a run
     does not have is null, and so is NaN, which databases order above all numbers. The auxiliary
-    channels are those of all runs in the folder. Files are written atomically and never replaced;
-    another call continues an interrupted export.
+    channels of all runs in the folder are included. Files are written atomically and never
+    replaced; another call continues an interrupted export.
 
     ``on_progress`` gets the completed share and the next recording. Raise InputError if the folder
     cannot be listed, a file cannot be written, or pyarrow is missing.

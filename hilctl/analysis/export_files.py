@@ -18,7 +18,7 @@ Columns: TypeAlias = Mapping[str, Any]
 Facts: TypeAlias = Mapping[str, str]
 
 _CSV_ROWS = 20_000
-_GROUP_ROWS = 2**20  # as pyarrow has it
+_GROUP_ROWS = 2**20  # the default of pyarrow
 _BATCH_ROWS = 2**16  # encoded together; a page has as many or twice that
 _WRITTEN_BYTES = 2**21  # per write: Arrow waits for the interpreter at each one
 
@@ -214,7 +214,7 @@ _FORMATS: dict[str, type[ColumnFile]] = {
 
 
 def file_class(path: Path) -> type[ColumnFile]:
-    """Return the writer of a path's suffix; raise InputError if there is none."""
+    """Return the writer for a path's suffix; raise InputError if it is unknown."""
     suffix = path.suffix.lower()
     added = {f".{name}": point for name, point in registered(EXPORT_FORMATS).items()}
     if suffix in _FORMATS:

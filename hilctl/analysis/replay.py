@@ -159,7 +159,7 @@ class _Running:
             raise DataError(f"{first.path}: had no compensator, so it has no reference to replay")
         if model is not None and model.input_unit != first.command_unit:
             driven = f"{first.path}: was driven in {first.command_unit}"
-            raise DataError(f"{driven}, the other model gives commands in {model.input_unit}")
+            raise DataError(f"{driven}, but the other model has commands in {model.input_unit}")
         rate_hz = first.sample_rate_hz
         self._prediction = None if model is None else ErrorPrediction(model, rate_hz)
         self._recorded = first.compensated

@@ -190,7 +190,7 @@ class RunReportBuilder:
 
 
 class _Extremes:
-    """Mean, lowest and highest of finite values; None if there is none."""
+    """Mean, lowest and highest of the finite values; None without any."""
 
     def __init__(self) -> None:
         self.low: float | None = None

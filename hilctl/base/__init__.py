@@ -1,4 +1,4 @@
-"""Shared types, errors and file formats; imports no other room.
+"""Shared types, errors and file formats; imports no other package of hilctl.
 
 A device in another package needs ``Device``, ``DeviceInfo``, ``DeviceOptions``, ``DeviceError`` and
 ``UnconfirmedError`` only.

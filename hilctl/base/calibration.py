@@ -13,7 +13,7 @@ from hilctl.base.errors import InputError
 from hilctl.base.strict import BeforeValidator, Field, StrictModel, model_validator
 from hilctl.base.types import F64, CommandUnit
 
-_POINTS = 1025  # of a polynomial: the error is below 1e-6 of the range
+_POINTS = 1025  # points of a polynomial: the error is below 1e-6 of the range
 _LEAST_RATIO, _MOST_RATIO = 0.5, 2.0  # beyond, a unit or a sensitivity is wrong
 GOOD_PERCENT, USABLE_PERCENT = 0.5, 2.0  # largest residual, of the calibrated range
 

@@ -138,7 +138,7 @@ Shown = TypeVar("Shown", bound=type)
 def shown_briefly(kind: Shown) -> Shown:
     """Show the objects of a dataclass or a pydantic model in one line, in a notebook as a table.
 
-    Arrays and nested objects are named by type and size; what is None or empty is omitted.
+    Arrays and nested objects are shown by type and size; None and empty values are omitted.
     """
 
     def text(self: Any) -> str:

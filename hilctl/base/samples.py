@@ -80,8 +80,8 @@ class Samples:
         index: int64[n], sample index since the start of the run; a jump is a gap.
         flags: uint32[n], bits of :class:`Flag`.
 
-    The columns are float64[n] each, commands in the command unit. A column that is neither
-    recorded nor equal to another one is empty. Their order is that of the rows of a block.
+    The columns are float64[n] each, commands in the command unit. A column that is neither recorded
+    nor equal to another one is empty. Columns have the order of the rows of a block.
     """
 
     index: I64
@@ -200,7 +200,7 @@ COLUMNS: dict[str, SampleColumn] = {
     for name, hint in get_type_hints(Samples, include_extras=True).items()
     if hasattr(hint, "__metadata__")
 }
-"""The columns by name; their order is that of the rows of a block's columns."""
+"""The columns by name, in the order of the rows of a block's columns."""
 RECORDED_FIELDS = tuple(
     dict.fromkeys(each.field(unit) for each in COLUMNS.values() for unit in ("A", "V"))
 )

@@ -229,7 +229,7 @@ def _live_text(progress: RunProgress) -> str:
 def reports_of(result: RunResult, *, every: bool) -> list[RunReport]:
     """Return the report of each axis of a finished run.
 
-    There is none of a very long one unless ``every`` is set.
+    A very long run has none unless ``every`` is set.
     """
     wanted = every or 0 < result.samples <= _LARGEST_REPORTED
     return [*map(api.summarize, result.recordings)] if wanted else []

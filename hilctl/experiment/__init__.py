@@ -7,4 +7,4 @@ PUBLIC = (
     "sections.open_loop", "sections.recording_settings", "sections.safe", "sections.timing",
     "state_files", "template",
 )  # fmt: skip
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

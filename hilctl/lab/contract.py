@@ -33,19 +33,19 @@ from hilctl.models.base import HysteresisModel, Operator
 from hilctl.models.model_file import dump_model, parse_model
 
 RATE_HZ = 50_000.0
-CUT = 71  # of a signal into two blocks
+CUT = 71  # sample at which a signal is cut into two blocks
 
 
 @dataclass(frozen=True)
 class KindCase:
-    """A model of a kind, and what it is checked with.
+    """A model of a kind, with the signals and tolerances of its checks.
 
     Attributes:
         model: A model as in a file: one for stages only is inside a staged model.
         command: Amplitude of the commands, in the input unit.
         centre: Middle of the commands.
         inverse_percent: Largest error of the inverse, of the peak-to-peak displacement.
-        fit: Name of the fit that gives such models; empty without one.
+        fit: Name of the fit that identifies such models; empty without one.
         settings: Of the fit.
         fit_percent: Largest error of a fit to the model's own displacement, of its peak-to-peak.
     """
@@ -135,7 +135,7 @@ def test_undoes_its_inverse(case: KindCase) -> None:
 
 
 def test_blocks_make_no_difference(case: KindCase, direction: str) -> None:
-    """Any division of a signal gives the same bits, and a new operator is at rest."""
+    """The division into blocks changes no bit, and a new operator is at rest."""
     signal, whole = wild(case, direction), operator_of(case, direction)
     expected = whole.process(signal.copy())
     parts = operator_of(case, direction)
@@ -205,7 +205,7 @@ def _run_matlab(folder: Path, signal: F64) -> F64:
 def test_exported_function_is_equal(
     case: KindCase, direction: str, suffix: str, program: str, run: Any, tmp_path: Path
 ) -> None:
-    """The C and MATLAB functions compute what the kernels compute, in two blocks."""
+    """The C and MATLAB functions agree with the kernels, in two blocks."""
     if not shutil.which(program):
         pytest.skip(f"{program} is not installed")
     file = tmp_path / f"made{suffix}"
@@ -217,7 +217,7 @@ def test_exported_function_is_equal(
 
 
 def test_is_identified_from_its_own_displacement(case: KindCase) -> None:
-    """The fit gives a model of this kind with a small error, and a usable inverse."""
+    """The fit returns a model of this kind with a small error, and a usable inverse."""
     if not case.fit:
         pytest.skip("no fit")
     settings = FitSettings(kind=case.fit, **case.settings)

@@ -13,7 +13,7 @@ _BINS = 8192
 _SHORTEST = 8  # samples of a part, for a few lines
 _AVERAGES = 8  # segments of an averaged spectrum that fit side by side
 _TIMES = 60
-_FEWEST_MEANS = 4  # that fit side by side at the longest averaging time
+_FEWEST_MEANS = 4  # means that fit side by side at the longest averaging time
 
 
 def coefficients(index: I64, period: float, values: F64, count: int) -> C128:
@@ -63,7 +63,7 @@ def density(values: F64, sample_rate_hz: float, shortest: int = 0) -> tuple[F64,
     """Return frequencies, the amplitude density per root Hz, float64[k] each, and its median.
 
     Averaged spectra of overlapping parts without their linear trend (Welch, Hann windows), of at
-    least ``shortest`` samples each. The median is that of white noise with this mean power.
+    least ``shortest`` samples each. The median is scaled to the mean power of white noise.
     """
     from scipy import signal  # it imports scipy.stats, which is slow
 

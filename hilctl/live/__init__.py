@@ -5,4 +5,4 @@ control socket. Killing it does not affect the run.
 """
 
 PUBLIC = ("run_reader", "server_process")
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

@@ -14,7 +14,8 @@ from hilctl.base.types import F64, I64, U32
 class Signal:
     """One signal: name for programs, label to display, and unit.
 
-    The unit is ``um``, ``command`` for that of the commands, or the text of an auxiliary channel's.
+    The unit is ``um``, ``command`` for the unit of the commands, or a text for an auxiliary
+    channel.
     """
 
     name: str
@@ -30,8 +31,7 @@ SIGNALS = (
     Signal("measured", "measured command", "command"),
     Signal("wanted", "command before the limiter", "command"),
 )
-"""The signals of every run; their order is that of the rows of every array of signals. The
-auxiliary channels of a run follow."""
+"""The signals of every run, in row order of every array of signals; auxiliary channels follow."""
 ROW = {signal.name: row for row, signal in enumerate(SIGNALS)}
 
 

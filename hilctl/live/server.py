@@ -247,7 +247,7 @@ def _content(name: str) -> bytes:
 
 
 def file_response(path: str) -> Response:
-    """Return the file at a path; 404 if there is none."""
+    """Return the file at a path; 404 if it does not exist."""
     if path not in FILES:
         return plain_response(HTTPStatus.NOT_FOUND, "no such file")
     name, kind = FILES[path]
@@ -358,7 +358,7 @@ class LiveServer:
         """Return the path of the report of a recording, which only this page knows.
 
         Raises:
-            InputError: There is no report of it, or another one is being made.
+            InputError: It has no report, or another report is being made.
         """
         if self._reporting.locked():
             raise InputError("another report is being made: try again when it is finished")

@@ -4,4 +4,4 @@ PUBLIC = (
     "adaptation", "block", "compensator", "feedback", "interlocks", "lead_in", "limiter", "loop",
     "pacer", "plan", "safe_output", "triggers", "tuning",
 )  # fmt: skip
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

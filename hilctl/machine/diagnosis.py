@@ -149,7 +149,7 @@ def disk_space(machine: Machine, folder: Path) -> _Found:
     while not place.exists():
         place = place.parent
     free = machine.free_bytes(place)
-    remedy = "make room, or set recording.folder to another disk"
+    remedy = "delete files, or set recording.folder to another disk"
     text = f"{free / 1e9:.1f} GB free for {folder}"
     return text, remedy if free < _LITTLE_SPACE_BYTES else ""
 

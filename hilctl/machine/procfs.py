@@ -71,7 +71,7 @@ class Machine:
             return None
 
     def number(self, name: str) -> int | None:
-        """Return the integer in a file; None if there is none."""
+        """Return the integer in a file; None without one."""
         text = self.text(name)
         try:
             return None if text is None else int(text)

@@ -4,4 +4,4 @@ PUBLIC = (
     "codec", "encoder", "metadata_keys", "reader", "recording", "recording_files", "recover",
     "run_summary", "schema", "time_range", "validation", "writer",
 )  # fmt: skip
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

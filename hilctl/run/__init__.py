@@ -5,4 +5,4 @@ PUBLIC = (
     "run_folder", "safety.manual_safe", "shared.ring", "shared.shared_page", "start",
     "unpaced",
 )  # fmt: skip
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

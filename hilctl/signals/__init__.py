@@ -1,4 +1,4 @@
 """Metrics of signals."""
 
 PUBLIC = ("cycle_metrics", "segment_metrics")
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

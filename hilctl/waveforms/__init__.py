@@ -1,4 +1,4 @@
 """Reference waveforms."""
 
 PUBLIC = ("build", "shapes", "spec")
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

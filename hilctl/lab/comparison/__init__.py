@@ -1,4 +1,4 @@
 """Comparison of hysteresis models on the same loops."""
 
 PUBLIC = ("compare", "comparison_page")
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

@@ -16,4 +16,4 @@ PUBLIC = (
     "fit_model", "model_page", "model_quality", "model_selection", "parallel", "pipeline",
     "refinement", "registry", "settings", "summary",
 )  # fmt: skip
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

@@ -24,7 +24,7 @@ PERIODS = 3
 """Simulated periods of a loop; the last is evaluated, since differential models settle slowly."""
 
 CREEP_S = 0.1  # time constant in the law of creep
-BEYOND = 0.15  # of half the range: margin of commands that an inverse may output
+BEYOND = 0.15  # margin of commands that an inverse may output, as a share of half the range
 
 LAG_S, GROWTH, SPACING, GAMMA_S = range(4)
 """Columns of derivatives by the parameters before the deadbands."""

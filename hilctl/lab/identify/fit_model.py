@@ -37,17 +37,17 @@ from hilctl.signals import cycle_metrics
 
 COARSE_S = 1e-3
 LEAST_REST_S = 0.5
-STILL = 1e-6  # of the command's range, from sample to sample
+STILL = 1e-6  # largest change per sample at rest, as a share of the command's range
 SETTLED_S = 0.01  # start of a rest that is ignored, until lags and structures have settled
 SHORTEST_S = 0.03  # time constant
-LONGEST = 10.0  # longest time constant, of the longest rest: slower creep looks linear
+LONGEST = 10.0  # longest time constant over the longest rest: slower creep looks linear
 APART = 2.0  # ratio of time constants, which approximate any law of creep
 FIRST_S, GROWTH = 0.005, 1.3  # first averaged interval of a rest, and ratio to the next
-ROUNDS = 4  # of a fixed-point iteration: each leaves a few percent of the error
+ROUNDS = 4  # rounds of a fixed-point iteration: each leaves a few percent of the error
 LEAST_SHARE = 1e-4
 CLEAR = 0.8  # part of the motion during rests that creep must explain
 MOST = 0.5  # maximum total share: a larger one is drift
-LEAST_MOVE = 3e-4  # of the stroke: minimum motion during rests
+LEAST_MOVE = 3e-4  # minimum motion during rests, as a share of the stroke
 
 
 @dataclass(frozen=True, slots=True)
@@ -66,7 +66,7 @@ class _Rest:
 
 
 def creep_of(records: Sequence[Record]) -> CreepModel | None:
-    """Return the creep during rests; None if there is none, or fewer than two rests of 0.5 s."""
+    """Return the creep during rests; None without creep or two rests of 0.5 s."""
     histories, rests = _resting(records)
     if len(rests) < 2:
         return None
@@ -160,7 +160,7 @@ class _LeastSquares:
         return cycle_metrics.rms(self._measured_um) > self._least_um
 
     def solve(self, bare_um: Sequence[F64]) -> CreepModel | None:
-        """Return the creep of displacements, float64[n] each; None if there is none."""
+        """Return the creep of displacements, float64[n] each; None without creep."""
         moves = np.stack([self._moved(bare_um, time_s) for time_s in self._times_s], axis=1)
         shares, left = nnls(moves, self._measured_um)
         explained = 1.0 - (left / max(float(np.linalg.norm(self._measured_um)), 1e-300)) ** 2

@@ -87,7 +87,7 @@ ErrorAndSlopes: TypeAlias = Callable[[F64], tuple[F64, F64]]
 
 SETTLED_SQUARES = 1e-3  # relative fall of the sum of squares that ends a descent
 SLACK = 1e-6  # slope at a bound that is left alone, relative to the largest
-STEP_RIDGE = 1e-10  # of the largest diagonal element
+STEP_RIDGE = 1e-10  # ridge, as a share of the largest diagonal element
 
 
 def descend(evaluate: ErrorAndSlopes, x: F64, low: F64, high: F64, rounds: int) -> tuple[F64, F64]:
@@ -154,8 +154,8 @@ def bounded_solution(normal: F64, right: F64, low: F64, high: F64) -> F64:
 
 STEPS, TRIALS = 5, 8  # maximum of steps taken, and of steps tried
 SETTLED_STEP = 0.02  # units: a smaller step ends the search
-ENOUGH = 3e-3  # of the sum of squares: a smaller gain ends the search
-HELD = 1e-6  # of the first sum of squares: penalty of one unit away from the start
+ENOUGH = 3e-3  # smaller gains, as a share of the sum of squares, end the search
+HELD = 1e-6  # penalty of one unit away from the start, as a share of the first sum of squares
 
 
 @dataclass(frozen=True, slots=True)

@@ -18,10 +18,10 @@ from hilctl.lab.identify.settings import FitSettings
 
 Grade: TypeAlias = Literal["good", "usable", "poor", "not a model"]
 
-GOOD_PERCENT = 2.0  # of a motion's own peak-to-peak
+GOOD_PERCENT = 2.0  # percent of a motion's own peak-to-peak
 USABLE_PERCENT = 5.0
-ALLOWED = {"tenth stroke": 2.0}  # times these limits, because noise is larger there
-MOST_PERCENT = 25.0  # of a record's own peak-to-peak, the typical error of a straight line
+ALLOWED = {"tenth stroke": 2.0}  # factors of these limits, because noise is larger there
+MOST_PERCENT = 25.0  # percent of a record's own peak-to-peak, the typical error of a straight line
 FOLLOWED = 0.5  # part of the variance of the displacement that a model must explain
 EVEN = 0.5  # correlation with the command's distance from its middle
 LIKELY_UM = 500.0

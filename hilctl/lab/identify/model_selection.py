@@ -25,8 +25,8 @@ FEWEST_LOOPS = 4
 FOLDS = 3
 SEED = 1
 HEAD = 0.7  # part of a history that is fitted if the rest is held out
-SAME = 0.02  # of a span: what counts as within it
-MOVES = 0.1  # of a history's peak-to-peak: least motion of a last part that is held out
+SAME = 0.02  # tolerance of a span, as a share of it
+MOVES = 0.1  # least motion of a held-out last part, as a share of a history's peak-to-peak
 
 
 @dataclass(frozen=True, slots=True)
@@ -181,8 +181,8 @@ PLAIN: Mapping[str, Any] = {"kind": "integrated", "offset": True}
 WELL_PERCENT = 0.6  # mean error by stroke that small models of the right kind reach
 IN_FULL = {"field", "generalised_duhem"}
 """Kinds with a larger candidate, of their default size, if their small model has a small error."""
-NEAR = 2.0  # times the least error: a small model of the best kind may have it
-WORTH = 0.95  # of the error: a larger model must be below it, since it slows every run
+NEAR = 2.0  # largest error of a small model of the best kind, over the least error
+WORTH = 0.95  # a larger model must have at most this share of the error, since it slows every run
 LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated", "offset": True})
 """Candidates for steady loops."""
 MOST_LAG = 8  # samples tried

@@ -58,7 +58,7 @@ class Fit:
 
 
 def fit_named(name: str) -> Fit:
-    """Return a fit; raise InputError if there is none of this name, or it cannot be loaded."""
+    """Return a fit; raise InputError if its name is unknown, or it cannot be loaded."""
     found: Fit = load(FITS, name)
     return found
 

@@ -178,12 +178,12 @@ class IdentifySettings(FitSettings):
         return {"whole": True, **given} if fit and fit.whole else given
 
     def unit(self, recorded: CommandUnit | None) -> CommandUnit:
-        """Return the unit of the command: that of the recordings if there are any."""
+        """Return the unit of the command, from the recordings if there are any."""
         return recorded or self.table.unit or self.fit.unit
 
 
 def _fit_in(given: Any) -> Fit | None:
-    """Return the fit of unchecked settings; None if there is none of its name."""
+    """Return the fit of unchecked settings; None if its name is unknown."""
     kind = given.get("kind", "integrated") if isinstance(given, dict) else None
     return fit_named(kind) if isinstance(kind, str) and kind in known(FITS) else None
 

@@ -1,4 +1,4 @@
 """Iterative learning control: the error of one run corrects the input of the next."""
 
 PUBLIC = ("cycle", "update")
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

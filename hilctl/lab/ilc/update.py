@@ -119,7 +119,7 @@ def fit(
         for slow in (0.05, 0.7, 2.0)
     ]
     best = min(tries, key=lambda each: float(each.cost)).x
-    if best[2] < (highest / sample_rate_hz) ** 2:  # above the sample rate: there is none
+    if best[2] < (highest / sample_rate_hz) ** 2:  # above the sample rate: no resonance
         best[2] = 0.0
     return _response_at(best, highest, sample_rate_hz)
 
@@ -269,7 +269,7 @@ def _response(state: IlcState) -> IlcResponse:
 
 
 def _answer(state: IlcState, frequency: F64) -> C128:
-    """Return the mean of fitted and measured responses; the latter show what the fit lacks."""
+    """Return the mean of fitted and measured responses; the latter include further resonances."""
     fitted = state.response.at(frequency)
     total_weight = (_FIT_DOUBT * np.abs(fitted)) ** -2.0
     total: C128 = total_weight * fitted

@@ -1,4 +1,4 @@
 """Models as functions in C and MATLAB."""
 
 PUBLIC = ("model_export",)
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

@@ -29,7 +29,7 @@ FORMATS = ("svg", "pdf", "png")
 UNDATED_SVG: dict[str, Any] = {"Date": None, "Creator": None, "Format": None, "Type": None}
 """Metadata that makes the bytes of equal figures equal."""
 
-_DPI = 600  # of PNG files, as journals require for line drawings
+_DPI = 600  # resolution of PNG files, as journals require for line drawings
 _UNDATED: dict[str, Any] = {
     "svg": UNDATED_SVG,
     "pdf": {"CreationDate": None},
@@ -40,7 +40,7 @@ _LEGEND_LINE_MM = 3.6
 _SPARE_MM = 4.0
 _CHARACTER_MM = 1.5  # average width
 _HANDLE_MM = 9.0
-_NAMES_MM = 14.0  # of an axis and its ticks, beside a title
+_NAMES_MM = 14.0  # width of an axis and its ticks, beside a title
 _LEAST_MM = 48.0
 _FEWEST_NAMED = 2  # a single line is named by its axes
 

@@ -228,7 +228,7 @@ DEFINITIONS = {
         "Difference of the highest and the lowest displacement from rest, over the peak-to-peak."
     ),
     "model error": (
-        "Largest difference of the measured displacement and that of the model, over the "
+        "Largest difference of the measured and the modelled displacement, over the "
         "peak-to-peak displacement."
     ),
     "coherence": (

@@ -1,4 +1,4 @@
 """Frequency and step responses, spectra, feedback design: measurement, fit, plots and pages."""
 
 PUBLIC = ("bode", "feedback_design", "frequency_response", "segment_spectrum", "step_response")
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

@@ -37,10 +37,10 @@ SIGNALS: tuple[Signals, ...] = get_args(Signals)
 
 _FEWEST_LINES = 4
 _FEWEST_PERIODS = 2
-_STRONG = 0.2  # of the largest line of a multisine's input: excited
-_WEAK = 1e-3  # of the largest power of another input: not excited
+_STRONG = 0.2  # excited lines of a multisine, as a share of the largest line of its input
+_WEAK = 1e-3  # lines of another input that are not excited, as a share of its largest power
 _AVERAGES = {"chirp": 4}  # segments that fit side by side; overlapping, nearly twice as many
-_MOST_AVERAGES = 16  # the same of other waveforms; a resonance must decay within a segment
+_MOST_AVERAGES = 16  # the same for other waveforms; a resonance must decay within a segment
 _OVERLAP = 1.056  # loss of averages, because half of each Hann window is in the next one
 _USABLE = 0.3  # largest relative noise of a line
 

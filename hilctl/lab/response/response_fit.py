@@ -10,8 +10,8 @@ from scipy.optimize import OptimizeResult, least_squares
 from hilctl.base.types import C128, F64
 from hilctl.models.linear_stages import MODE_NUMBERS, modes_of, second_order
 
-_HYSTERESIS = 0.03  # of a line, that no linear response explains
-_WORTH = 0.5  # of the misfit that a resonance must explain
+_HYSTERESIS = 0.03  # share of a line that no linear response explains
+_WORTH = 0.5  # share of the misfit that a resonance must explain
 _MOST_DAMPING = 0.8
 _MOST_FURTHER = 2  # modes beside the first
 _WORTH_FURTHER = 0.25
@@ -98,7 +98,7 @@ def _chosen(hz: F64, response: C128, noise: F64, rate_hz: float) -> OptimizeResu
         if plausible and more.cost < worth * found.cost:
             found = more
         elif found.x.size > 3:
-            break  # otherwise two modes may explain what one alone does not
+            break  # otherwise two modes may explain the misfit of one
     return found
 
 

@@ -30,7 +30,7 @@ from hilctl.lab.spectrum import (
 from hilctl.recording.recording import Recording
 
 _HARMONICS = 20
-_LINE_CYCLES = 8.0  # of a sine in each averaged spectrum, so that lines are narrow
+_LINE_CYCLES = 8.0  # cycles of a sine in each averaged spectrum, so that lines are narrow
 _FEWEST_CYCLES = 2
 _FEWEST_SAMPLES = 16
 _FLICKER = math.sqrt(2.0 * math.log(2.0) / math.pi)  # Allan deviation over bias instability

@@ -23,16 +23,16 @@ _NOISE = 4.0  # standard deviations of the noise in half a band
 SETTLED_PERCENT = 5.0
 """Default band about the end of a step, in percent of its height."""
 
-_CYCLES = 8.0  # of the ringing, in the fit
+_CYCLES = 8.0  # cycles of the ringing in the fit
 _FEWEST = 40  # samples
 _SEEN = 5.0  # least amplitude of the ringing over the misfit
 _MOST_DAMPING = 0.9
-_LOWEST_CYCLES = 4.0  # in the signal
-_HIGHEST = 0.1  # of the sample rate
+_LOWEST_CYCLES = 4.0  # cycles of the slowest ringing in the signal
+_HIGHEST = 0.1  # highest frequency of a ringing, as a share of the sample rate
 _FREQUENCIES = 40
 _REFINED = 3
 _DAMPINGS = (0.05, 0.15, 0.4)
-_RATES = (0.1, 0.5, 2.0)  # of the creep, over the angular frequency
+_RATES = (0.1, 0.5, 2.0)  # starting rates of the creep, over the angular frequency
 
 
 @dataclass(frozen=True, slots=True)
@@ -45,7 +45,7 @@ class Ringing:
 
 
 def ringing(displacement_um: F64, sample_rate_hz: float) -> Ringing | None:
-    """Fit the ringing of a displacement, float64[n], after a step; None if there is none."""
+    """Fit the ringing of a displacement, float64[n], after a step; None without ringing."""
     if displacement_um.size < 2 * _FEWEST or not np.ptp(displacement_um) > 0.0:
         return None
     lowest_hz = _LOWEST_CYCLES * sample_rate_hz / displacement_um.size
@@ -129,7 +129,7 @@ class StepResponse:
             noise of the last tenth exceeds it.
         band_percent: The band about the end, in percent of the height.
         overshoot_percent: Largest excess over the height, in percent of it.
-        natural_hz: Natural frequency of the ringing; None if there is none.
+        natural_hz: Natural frequency of the ringing; None without ringing.
         damping_ratio: Its damping ratio; None without ringing.
     """
 

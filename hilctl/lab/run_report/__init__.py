@@ -1,4 +1,4 @@
 """Plots and page of a recording."""
 
 PUBLIC = ("contour_page", "decimation", "run_page")
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

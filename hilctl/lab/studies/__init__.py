@@ -6,4 +6,4 @@ PUBLIC = (
     "learn", "multi_run.collect", "multi_run.multi_run_page", "multi_run.plots",
     "multi_run.varied_parameter", "study", "study_folder",
 )  # fmt: skip
-"""Modules that other rooms import; the others are private."""
+"""Modules that other packages import; the others are private."""

@@ -31,12 +31,12 @@ from hilctl.signals.cycle_metrics import rms
 
 _HIGHEST_ORDER = 4
 _BETTER = 1.1  # an order must lower the error of left-out points by this factor
-_MUCH_BETTER = 2.0  # and a table that of the best polynomial
-_CHANCE = 1e-3  # of points with normal noise to have an outlier
+_MUCH_BETTER = 2.0  # a table must lower the error of the best polynomial by this factor
+_CHANCE = 1e-3  # probability of an outlier among points with normal noise
 _MOST_OUTLIERS, _POINTS_PER_OUTLIER = 5, 7
 _WORDS = {"reading": {"reading", "readings", "sensor", "indicated"},
           "true": {"true", "reference", "actual"}}  # fmt: skip
-_PART = 0.1  # of the way from the safe value to the limits
+_PART = 0.1  # share of the way from the safe value to the limits
 _STEPS = 11  # levels from one end to the other
 _DWELL_S, _DWELL_SAMPLES = 0.4, 20
 
@@ -152,7 +152,7 @@ class _Curve(NamedTuple):
     x: F64
     y: F64
     residuals: F64
-    left_out: F64  # error of each point if it is left out
+    left_out: F64  # error of each point if it is omitted
     freedom: int  # of the residuals
 
 

@@ -226,7 +226,7 @@ class _SegmentMean:
 
 def find_cycles(history: History, points: int = 300) -> SteadyLoop:
     """Return the averaged cycle of a history's periodic part; raise DataError without one."""
-    # The first cycle is ignored, because its hysteresis depends on what came before.
+    # The first cycle is ignored, because its hysteresis depends on earlier motion.
     command = history.command[history.ignore :]
     displacement_um = history.displacement_um[history.ignore :]
     period, start, stop = find_period(history.label, command)

@@ -261,8 +261,8 @@ def without_gaps(
     """Return every value of two columns in [start, stop), with gaps filled.
 
     The command is held, as the device holds its output in skipped ticks. The displacement in um is
-    interpolated: it approaches that of the held command, which the next sample still shows. Raise
-    DataError if more than 1 % of the samples are missing or have no displacement.
+    interpolated: it approaches the value of the held command, which the next sample still shows.
+    Raise DataError if more than 1 % of the samples are missing or have no displacement.
     """
     samples = recording.samples.part(start, stop)
     signals = samples.index, samples.column(held), samples.column(interpolated)
@@ -300,7 +300,7 @@ def history_from_pieces(pieces: Iterable[Recording]) -> History:
     for piece in pieces:
         samples = piece.samples
         condition = (samples.flags & Flag.CONDITION.value) != 0
-        if condition.any() and not conditioned:  # conditioning erases what came before
+        if condition.any() and not conditioned:  # conditioning erases earlier motion
             samples = samples.rows(slice(int(np.argmax(condition)), None))
             indices, command, displacement_um = [], [], []
             begins_at = next_sample = int(samples.index[0])

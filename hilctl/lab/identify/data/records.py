@@ -169,16 +169,16 @@ class ThinHistory(History):
         return self.rates
 
     def run(self) -> tuple[F64, F64, int]:
-        """Return what a model is run on, see :meth:`History.run`."""
+        """Return the samples to simulate, see :meth:`History.run`."""
         return self.command, self.rates, self.ignore
 
 
 def thinned(records: Sequence[Record], most: int = MOST_SAMPLES) -> tuple[Record, ...]:
     """Return records, of each longer history about ``most`` samples and its turning points.
 
-    Samples that are not evaluated because of skipped ticks are left out.
-    Turning points determine the memory of a model without dynamics. The other samples are random,
-    one per interval: evenly spaced ones might meet a few phases of a periodic command only.
+    Samples that are not evaluated because of skipped ticks are omitted. Turning points determine
+    the memory of a model without dynamics. The other samples are random, one per interval: evenly
+    spaced ones might meet a few phases of a periodic command only.
     """
     return tuple(
         _thin(record, most)

@@ -69,7 +69,7 @@ _Found = TypeVar("_Found")
 
 
 class Latest(Generic[_Found]):
-    """The last result of a computation; a search often changes what it does not depend on."""
+    """The last result of a computation, reused until a search changes its arguments."""
 
     def __init__(self) -> None:
         self._known: tuple[object, _Found] | None = None

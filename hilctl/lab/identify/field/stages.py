@@ -159,7 +159,7 @@ class StageSpace:
         return np.clip(row(stages), self.low, self.high)
 
     def at_bound(self, stages: Stages) -> tuple[str, ...]:
-        """Return the published names of what is at a bound; a loss of 0 is none that is missing."""
+        """Return the published names of stages at a bound; a loss of 0 does not count."""
         x, room = row(stages), AT_BOUND * (self.high - self.low)
         held = (x >= self.high - room) | ((x <= self.low + room) & (self.low > 0.0))
         held &= self.high > self.low

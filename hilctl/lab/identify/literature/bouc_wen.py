@@ -15,7 +15,7 @@ from hilctl.lab.identify.registry import ANY, Fit
 from hilctl.models.literature.bouc_wen import BoucWenModel
 from hilctl.models.literature.implicit_models import NOTHING
 
-_BETAS = (0.1, 0.3, 1.0, 3.0, 10.0)  # times the reach to the n
+_BETAS = (0.1, 0.3, 1.0, 3.0, 10.0)  # starting values of beta times reach^n
 _EVALUATIONS = 100
 _NAMES = ("direct", "hysteretic", "beta", "gamma", "exponent", "output_offset_um")
 

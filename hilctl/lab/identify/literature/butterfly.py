@@ -19,8 +19,8 @@ from hilctl.models.integrated import DeadbandFunction
 from hilctl.models.literature.butterfly import ButterflyModel
 
 _CORNERS = 16  # slopes of the even function
-_NEAR = 0.1  # of the stroke: distance to the turning point for a change of wing
-_DEEP = 0.01  # of the stroke: smaller minima are noise
+_NEAR = 0.1  # largest distance to the turning point for a change of wing, as a share of the stroke
+_DEEP = 0.01  # smaller minima are noise, as a share of the stroke
 _STEEPEST = 30.0  # slopes of S^-1, relative to the mean one
 _LEAST = 0.1
 _NONE = 1e-12  # least squares take no bounds that are equal

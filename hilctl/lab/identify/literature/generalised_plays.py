@@ -11,9 +11,9 @@ from hilctl.lab.identify.literature.weights import WEIGHTS_FOLLOW, ShapeSearch, 
 from hilctl.lab.identify.registry import ANY, Fit
 from hilctl.models.literature.generalised_plays import GeneralisedModel, PlayEnvelope
 
-_SLOPES = (0.3, 0.7, 1.2)  # of the envelopes, times the reach
+_SLOPES = (0.3, 0.7, 1.2)  # starting slopes of the envelopes, times the reach
 _SHIFTS = (-0.6, 0.0, 0.6)
-_FEW_EVALUATIONS = 40  # of a search that another one follows
+_FEW_EVALUATIONS = 40  # for a search that another one follows
 _FOLLOWED = 3  # starts: some end at other minima
 _POLISH = 8  # evaluations with all samples
 _ENOUGH = 3_000  # samples until the best start is known

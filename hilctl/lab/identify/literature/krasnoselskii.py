@@ -23,7 +23,7 @@ def fit_kp(job: FitJob) -> FoundModel:
     columns = data.stack(lambda v: _kp_outputs(v, places[row], places[column], spacing))
     least = np.where(row == column, 0.5 * spacing * job.least, 0.0)
     moved = largest_swing(columns, data.places) > STILL * 2.0
-    # Operators of one width, side by side, are what a line of the Preisach triangle is.
+    # Operators of one width, side by side, correspond to a line of the Preisach triangle.
     table = np.full((levels, levels), -1)
     table[row - column, column] = numbered(moved)
     weights = np.zeros(row.size)

@@ -18,12 +18,12 @@ from hilctl.lab.identify.settings import FitSettings
 from hilctl.models.integrated import IntegratedModel, exponential_integrated, exponential_weights
 from hilctl.models.plays import PlayModel, PpiModel, RdpiModel, SpiModel
 
-SEED = 1  # of the random starts
+SEED = 1  # seed of the random starts
 
 DRAWS_A_START = 12  # random points tried per start
 EVALUATIONS = 60  # maximum per start
 POLISH = 300  # maximum for the best start
-HELD = 1e-4  # of the space: distance to a bound that counts as at the bound
+HELD = 1e-4  # distance to a bound that counts as at the bound, as a share of the space
 
 
 @dataclass(frozen=True, slots=True)
@@ -246,7 +246,7 @@ class PlaysProblem:
         return bounded_and_free(columns, self._free, self._target, scale, self._least())
 
     def _least(self) -> F64:
-        """Return the lower bounds of the weights; the first is that of a_0."""
+        """Return the lower bounds of the weights, a_0 first."""
         least = np.zeros(2 if self._exponential else self._settings.plays + 1)
         least[0] = LEAST_SLOPE * self._data.gain
         return least

@@ -190,7 +190,7 @@ def segments(x: F64, corners: F64) -> F64:
     return np.asarray(np.clip(x[..., None], low, high) - np.clip(0.0, low, high))
 
 
-HIGHEST_DAMPING = 10.0  # of a FirstMode
+HIGHEST_DAMPING = 10.0  # largest damping ratio of a FirstMode
 
 
 def integrated_model(data: FitData, layers: Layers, point: Point) -> IntegratedModel:

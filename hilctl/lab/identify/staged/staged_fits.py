@@ -38,7 +38,7 @@ from hilctl.lab.identify.staged.objective import (
 from hilctl.models.integrated import IntegratedModel
 from hilctl.models.staged import StagedModel
 
-KNOTS = 16  # of Lambda^-1
+KNOTS = 16  # number of knots of Lambda^-1
 
 
 def convex_start(
@@ -111,10 +111,10 @@ ROUNDS = 10  # steps from every start
 FEW_POINTS = 50  # points per loop until the best start is known
 SOME_POINTS = 100  # points per loop in the next step
 POLISH = 60  # steps from the best start
-SPACINGS = (1.0, 0.6)  # of the largest possible spacing
-LAGS = (0.05, 0.12, 0.3, 0.8)  # of a radian at the highest frequency
-GAMMAS = (0.02, 0.06, 0.15, 0.4)  # of the growth at which thresholds reach the largest command
-DELAYS = (0.04, 0.15)  # of a radian
+SPACINGS = (1.0, 0.6)  # shares of the largest possible spacing
+LAGS = (0.05, 0.12, 0.3, 0.8)  # in radians at the highest frequency
+GAMMAS = (0.02, 0.06, 0.15, 0.4)  # times the growth at which thresholds reach the largest command
+DELAYS = (0.04, 0.15)  # in radians at the highest frequency
 
 
 @dataclass(frozen=True, slots=True)

@@ -92,7 +92,7 @@ MOST_STEPS = 10_000
 
 _NUMBER = r"[-+]?(?:\d+\.?\d*|\.\d+)(?:[eE][-+]?\d+)?"
 _RANGE = re.compile(rf"({_NUMBER}):({_NUMBER}):(\d+)(log|lin)?\Z")
-_DIGITS = 6  # of a value within a range
+_DIGITS = 6  # digits of a value within a range
 
 
 def values_of(given: Any) -> tuple[Any, ...]:

@@ -47,7 +47,7 @@ _CLEAR = 6.0  # standard errors of a clear reaction
 _EVEN = 2.0
 _FEWEST_CYCLES = 4
 _MEAN_S = 0.1
-_LONG = 10  # times that: shortest hold for creep
+_LONG = 10  # shortest hold for creep, over _MEAN_S
 
 
 def noise_at_rest(recording: Recording) -> RestNoise | None:
@@ -132,7 +132,7 @@ def small_signal(recording: Recording) -> FrequencyResponse:
     try:
         return frequency_response(recording)
     except NoisyResponseError as error:
-        remedy = "find what else moves the sensor, or widen the limits"
+        remedy = "find other causes of motion at the sensor, or widen the limits"
         raise RigProblemError("noise", f"small-signal response: {error}", remedy) from None
     except DataError as error:
         remedy = "on a busy computer, lower sample_rate_hz"
@@ -140,7 +140,7 @@ def small_signal(recording: Recording) -> FrequencyResponse:
 
 
 _FEWEST_STEPS = 500  # distinct readings in a motion, for equal readings to mean saturation
-_AT_END = 0.06  # of a cycle at the same extreme reading
+_AT_END = 0.06  # share of a cycle at the same extreme reading
 _OF_STROKE = 0.9  # small loops near an end rise above the largest loop, by 7 % of its stroke
 _FIRST_GROWTH = 1.5  # exponent of displacement over amplitude, until it is known
 _MORE_GROWTH = 0.2

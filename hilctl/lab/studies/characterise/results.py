@@ -160,7 +160,7 @@ def _without_signals(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 _SLACK = 0.01
-_NOISE_PEAK = 3.0  # times its rms: the largest noise in a motion
+_NOISE_PEAK = 3.0  # largest noise in a motion, over its rms
 
 FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "settled-loops", "training")
 """Steps for identification. Each starts with a motion of full amplitude, which erases the earlier
@@ -234,7 +234,7 @@ def validated(
         more = stroke_errors(reference.motions(stroke_um) for reference in references)
         classes = largest_errors((*known.classes, *more))
         within = max(each.peak_percent for each in classes)
-        # The grade is that of the model: the sensor's noise is left out of it.
+        # The grade concerns the model, so it excludes the sensor's noise.
         noise_percent = 100.0 * _NOISE_PEAK * noise_um / stroke_um
         models = [
             replace(each, peak_percent=each.peak_percent - noise_percent / STROKES[each.label])

@@ -30,7 +30,7 @@ from hilctl.lab.studies.characterise.waveforms import CREEP_S
 from hilctl.models.model_file import dump_model
 from hilctl.models.staged import StagedModel
 
-_CLOSE = 0.02  # of the duration, to either side
+_CLOSE = 0.02  # share of the duration shown to either side
 _SQUARE = 0.85
 
 

@@ -27,7 +27,7 @@ TRAINING_SEED = 100
 
 _ADAPTER: TypeAdapter[AnyWaveform] = TypeAdapter(AnyWaveform)
 _LINES_BELOW_TOP = 8.0  # lines of the small multisine within the band of loops
-_TOP = 0.2  # of the sample rate: its highest line
+_TOP = 0.2  # highest line, as a share of the sample rate
 _RESPONSE_S = 2.0
 _PERIODS = (6, 100)
 _CONDITIONING_CYCLES = 12
@@ -43,8 +43,8 @@ _SETTLED = (
     (0.25, (-0.75, -0.375, 0.0, 0.375, 0.75)),
 )
 """Amplitudes of loops that settle, of half the stroke, and their offsets from its middle."""
-_MOST_COMMAND = 3.0  # of a loop that settles, relative to the one in the middle
-_RANDOM_BAND = (5.0, 0.5)  # of the lowest and of the highest frequency of loops
+_MOST_COMMAND = 3.0  # largest command of a loop that settles, relative to the one in the middle
+_RANDOM_BAND = (5.0, 0.5)  # times the lowest and the highest frequency of loops
 
 
 def reference_of(limits: CharacterisationLimits, keys: Keys) -> Reference:

@@ -39,7 +39,7 @@ from hilctl.lab.studies.multi_run.trend import (
 )
 from hilctl.lab.studies.multi_run.varied_parameter import VariedParameter, texts_of
 
-_WIDE_RATIO = 30.0  # of a range that needs a logarithmic axis
+_WIDE_RATIO = 30.0  # ratio of a range that needs a logarithmic axis
 _MANY = 10
 _HEADROOM = 1.08
 _LONGEST_NAME = 24

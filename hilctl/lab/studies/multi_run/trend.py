@@ -12,7 +12,7 @@ from hilctl.base.types import F64
 from hilctl.lab.studies.multi_run.collect import RunSeries, SeriesRun
 from hilctl.lab.studies.multi_run.varied_parameter import VariedParameter, rank_of
 
-_SPREAD = 0.02  # of the mean: less is no change
+_SPREAD = 0.02  # smaller changes, as a share of the mean, count as none
 _FEWEST = 3
 
 
