@@ -185,7 +185,7 @@ def recordings_by_axis(paths: Sequence[Path]) -> dict[str, Path]:
     found = {each[AXIS_FACT]: path for path, each in facts.items()
              if each.get("run_id") == run_id and each.get(AXIS_FACT) in names}  # fmt: skip
     if missing := [name for name in names if name not in found]:
-        _log.warning("%s: no recording of axis %s in it", paths[0].parent, ", ".join(missing))
+        _log.warning("%s: contains no recording of axis %s", paths[0].parent, ", ".join(missing))
     return {name: found[name] for name in names if name in found} if len(found) > 1 else {}
 
 

@@ -117,7 +117,7 @@ class ReplayResult:
 def replay(
     recording: Recording | Iterable[Recording], model: HysteresisModel | None = None
 ) -> ReplayResult:
-    """Recompute every command, perhaps with another model than the recorded one.
+    """Recompute every command, optionally with a model other than the recorded one.
 
     For bounded memory, ``recording`` is the run's pieces in order
     (:class:`hilctl.recording.reader.RecordingStream`). They are read twice if the inverse was

@@ -73,7 +73,7 @@ class ConfigError(InputError):
 
 
 class ModelError(InputError):
-    """Model parameters break a condition, named with its index, of the model or of its inverse."""
+    """Model parameters violate a condition of the model or its inverse, named with its index."""
 
 
 class DataError(InputError):

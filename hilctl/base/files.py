@@ -53,17 +53,17 @@ def read_text(path: Path, max_bytes: int = MAX_TEXT_BYTES) -> str:
 
 
 def exists(path: Path) -> bool:
-    """Return whether a path exists; unlike Path.exists, false instead of an OSError."""
+    """Return whether a path exists; unlike Path.exists, never raise OSError."""
     return os.path.exists(path)  # noqa: PTH110
 
 
 def is_file(path: Path) -> bool:
-    """Return whether a path is a file; unlike Path.is_file, false instead of an OSError."""
+    """Return whether a path is a file; unlike Path.is_file, never raise OSError."""
     return os.path.isfile(path)  # noqa: PTH113
 
 
 def is_folder(path: Path) -> bool:
-    """Return whether a path is a folder; unlike Path.is_dir, false instead of an OSError."""
+    """Return whether a path is a folder; unlike Path.is_dir, never raise OSError."""
     return os.path.isdir(path)  # noqa: PTH112
 
 
@@ -213,7 +213,7 @@ def _written(path: Path, *, overwrite: bool) -> Iterator[AtomicFile]:
 def already_there(path: Path, remedy: str) -> InputError:
     """Return the error for an existing file, with its fix unless it is a folder."""
     if path.is_dir():
-        return InputError(f"{path}: is a folder: name a file in it")
+        return InputError(f"{path}: is a folder: specify a file in it")
     return InputError(f"{path}: exists already: {remedy}")
 
 
@@ -252,7 +252,7 @@ REMEDIES = {
     errno.EDQUOT: "delete files, or use another file system",
     errno.ENAMETOOLONG: "use a shorter name",
     errno.ENOTDIR: "a part of that path is a file",
-    errno.EISDIR: "name a file in that folder",
+    errno.EISDIR: "specify a file in that folder",
     errno.EMFILE: "close some, or raise the limit: ulimit -n",
 }
 ADDRESS_REMEDIES = {

@@ -523,7 +523,7 @@ def open_table(path: Path, skip_rows: int = 0) -> Table:
     if most == 0:
         raise InputError(f"{path}: contains no array of numbers")
     if len(columns) > MAX_COLUMNS:
-        raise InputError(f"{path}: holds {len(columns)} columns, at most {MAX_COLUMNS} are read")
+        raise InputError(f"{path}: must have at most {MAX_COLUMNS} columns, got {len(columns)}")
     return ArrayTable(path, columns)
 
 
@@ -536,7 +536,7 @@ def _npy(path: Path) -> _Columns:
     except (ValueError, OSError, EOFError, OverflowError, TypeError, TokenError):
         raise InputError(f"{path}: is not a complete NumPy file (.npy) of numbers") from None
     if not isinstance(table, np.ndarray) or table.ndim not in {1, 2}:
-        raise InputError(f"{path}: must hold a one- or two-dimensional array of numbers")
+        raise InputError(f"{path}: must contain a one- or two-dimensional array of numbers")
     return {str(at): each for at, each in enumerate(np.atleast_2d(table.T), start=1)}
 
 

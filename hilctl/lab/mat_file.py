@@ -56,7 +56,9 @@ class MatFile(StoredColumns):
         super().add(columns)
         if 8 * self.rows > _LARGEST_BYTES:
             most = _LARGEST_BYTES // 8
-            raise InputError(f".mat holds at most {most} samples: use --from and --to, or .parquet")
+            raise InputError(
+                f"a .mat file holds at most {most} samples: use --from, --to or .parquet"
+            )
 
     def finish(self, facts: Facts) -> None:
         """Write the file; each column is copied to memory in turn."""

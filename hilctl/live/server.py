@@ -148,7 +148,7 @@ class PageSession:
         except ValidationError as error:
             return first_problem(error)
         except asyncio.QueueFull:
-            return f"{_MOST_WAITING} requests of this page are waiting already: try again"
+            return f"{_MOST_WAITING} requests of this page are already waiting: try again"
         return ""
 
     async def _execute(self, waiting: asyncio.Queue[PageMessage]) -> None:

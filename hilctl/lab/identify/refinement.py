@@ -88,9 +88,7 @@ def refine_records(old: HysteresisModel, request: FitRequest) -> Refinement:
     Raise DataError if the runs cannot be used, or are in another unit than the model's commands.
     """
     if request.unit != old.input_unit:
-        raise DataError(
-            f"the runs were recorded in {request.unit}, the model takes {old.input_unit}"
-        )
+        raise DataError(f"the runs have commands in {request.unit}, the model in {old.input_unit}")
     found, offsets_um = _identified(request)
     held_out = found.held_out
     if held_out is None:

@@ -137,7 +137,7 @@ class FrequencyResponse:
         return np.degrees(np.unwrap(np.angle(self.response)))
 
     def size_at(self, frequency_hz: float) -> float:
-        """Return the fitted magnitude at a frequency, over that at the lowest line."""
+        """Return the fitted magnitude at a frequency, relative to the lowest line."""
         size = np.abs(self.fitted)
         return float(np.interp(frequency_hz, self.frequency_hz, size) / size[0])
 

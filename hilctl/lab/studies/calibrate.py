@@ -73,7 +73,7 @@ class CalibrationFit:
 
 
 class SensorPoints(NamedTuple):
-    """Points of a sensor by rising reading."""
+    """Points of a sensor, sorted by reading."""
 
     path: Path  # their table
     reading: F64  # um, float64[n]

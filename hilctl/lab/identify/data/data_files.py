@@ -328,7 +328,7 @@ def history_from_pieces(pieces: Iterable[Recording]) -> History:
             "use its steady cycles"
         )
     if next_sample == begins_at:
-        raise DataError(f"{piece.path}: holds no sample of the waveform")
+        raise DataError(f"{piece.path}: contains no samples of the waveform")
     if lost:
         raise DataError(
             f"{piece.path}: samples are missing whose command is unknown, so it cannot be fitted "

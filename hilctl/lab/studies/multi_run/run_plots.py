@@ -167,7 +167,7 @@ Pair = tuple[str, RunDigest, list[tuple[str, RunDigest]]]
 
 
 def pairs_of(series: RunSeries) -> list[Pair]:
-    """Return each run without a compensator, with the runs of the same settings with one."""
+    """Return each run without a compensator, with the compensated runs of the same settings."""
     with_loop = [each for each in series.measured if each[1].loop.size]
     before = [each for each in with_loop if not each[1].compensated]
     after = [each for each in with_loop if each[1].compensated]
