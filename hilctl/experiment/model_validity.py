@@ -61,7 +61,7 @@ def spectrum(
     values: F64,  # float64[n]
     sample_rate_hz: float,
     slowest_hz: float,  # frequency that is to be resolved
-    least_move: float = 0.0,  # peak-to-peak value below which a window is ignored
+    least_move: float = 0.0,  # peak-to-peak value, beside its line, below which a window is ignored
     told: tuple[slice, ...] | None = None,  # representative parts; None for the whole signal
 ) -> Spectrum:
     """Return the frequencies of a signal, window after window."""
@@ -72,10 +72,12 @@ def spectrum(
     step_hz = sample_rate_hz / size
     main = highest = 0
     for windows in _windows(values, size, parts):
-        batch = windows[np.ptp(windows, axis=1) > least_move]
+        curved = windows - _lines(windows)
+        # Of a straight part only rounding errors are left, whose spectrum is flat.
+        batch = curved[np.ptp(curved, axis=1) > least_move]
         if not len(batch):
             continue
-        tapered = (batch - _lines(batch)) * np.hanning(size)
+        tapered = batch * np.hanning(size)
         power = np.cumsum(np.abs(np.fft.rfft(tapered, axis=1)) ** 2, axis=1)
         main = max(main, int((power < MOST * power[:, -1:]).sum(axis=1).max()))
         highest = max(highest, int((power < ALL * power[:, -1:]).sum(axis=1).max()))

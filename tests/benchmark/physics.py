@@ -37,6 +37,14 @@ from tests.rigs import register
 register()
 
 CONFIGS = Path(__file__).parents[2] / "configs"
+LEAF_STAGES = {
+    "plain": (),
+    "accommodation": ("forgetting=0.05",),
+    "creep": ("creep_percent=1.2",),
+    "friction": ("rubbing_um=0.4",),
+    "two_modes": ("modes=[[760, 0.03, 0.7], [930, 0.03, 0.3]]",),
+}
+LEAF_STAGES["all"] = tuple(each for added in LEAF_STAGES.values() for each in added)
 RIGS: dict[str, tuple[str, ...]] = {
     "pinned_cells": ("terfenol_sine_6a.yaml",),
     **{
@@ -48,6 +56,16 @@ RIGS: dict[str, tuple[str, ...]] = {
         "device.kind=simulated_thermal_switching",
         "limits.slew_v_per_s=200000",
     ),
+    **{
+        f"leaf_stage_{name}": (
+            "piezo_sine.yaml",
+            "device.kind=simulated_leaf_stage",
+            "limits.slew_v_per_s=200000",
+            "limits.stroke_um=[-5, 40]",
+            *(f"device.{each}" for each in added),
+        )
+        for name, added in LEAF_STAGES.items()
+    },
 }
 """Experiment file and settings of each rig."""
 MARGIN = 0.06  # of the range that a model was identified on, at either end

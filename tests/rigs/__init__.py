@@ -16,6 +16,7 @@ DEVICES = {
     "simulated_jiles_atherton": "tests.rigs.devices:SimulatedJilesAtherton",
     "simulated_growing_lag": "tests.rigs.devices:SimulatedGrowingLag",
     "simulated_thermal_switching": "tests.rigs.devices:SimulatedThermalSwitching",
+    "simulated_leaf_stage": "tests.rigs.devices:SimulatedLeafStage",
 }
 
 

@@ -13,6 +13,7 @@ from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from tests.rigs.diffusion import DiffusionParameters
 from tests.rigs.domains import DomainsParameters
 from tests.rigs.jiles_atherton import GrowingLagParameters, JilesAthertonParameters
+from tests.rigs.leaf_stage import LeafStage, LeafStageParameters
 from tests.rigs.thermal_switching import SwitchingActuator, SwitchingParameters
 
 RODS = {
@@ -94,3 +95,41 @@ class SimulatedThermalSwitching(SimulatedDevice):
     def plant(self, sample_rate_hz):
         """Return the stack at rest."""
         return SwitchingActuator(self._parameters, sample_rate_hz, self._seed)
+
+
+class LeafStageOptions(SimulatedOptions):
+    forgetting: float = Field(default=0.0, ge=0.0, description="see LeafStageParameters")
+    creep_percent: float = Field(default=0.0, ge=0.0, description="likewise, % per decade")
+    rubbing_um: float = Field(default=0.0, ge=0.0, description="likewise, um")
+    bristle_um: float = Field(default=0.4, gt=0.0, description="likewise, um")
+    modes: tuple[tuple[float, float, float], ...] = Field(
+        default=((760.0, 0.03, 1.0),), description="Hz, damping ratio and share"
+    )
+
+
+class SimulatedLeafStage(SimulatedDevice):
+    """A piezo stage on leaf springs with accommodation, creep, friction and modes."""
+
+    Options: ClassVar = LeafStageOptions
+
+    def __init__(self, options):
+        self._seed = options.seed
+        keys = ("forgetting", "creep_percent", "rubbing_um", "bristle_um", "modes")
+        self._parameters = LeafStageParameters(
+            **{key: getattr(options, key) for key in keys},
+            sensor_noise_um=2e-3 if options.noise else 0.0,
+        )
+        super().__init__(
+            options,
+            self._parameters,
+            name="simulated_leaf_stage",
+            description="simulated piezo stage on leaf springs, and capacitive sensor",
+            command_unit="V",
+            command_min=self._parameters.drive_min_v,
+            command_max=self._parameters.drive_max_v,
+            command_step=self._parameters.drive_max_v / self._parameters.dac_codes,
+        )
+
+    def plant(self, sample_rate_hz):
+        """Return the stage at rest."""
+        return LeafStage(self._parameters, sample_rate_hz, self._seed)

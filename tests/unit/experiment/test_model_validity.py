@@ -94,3 +94,13 @@ def test_a_slow_model_bounds_the_reference_as_well():
         known = {"provenance": Provenance(identified_range=slow)}
         found = range_findings(terfenol_rdpi().model_copy(update=known), reference)
         assert (len(found.warnings), len(found.refused)) == (warned, refused)
+
+
+@pytest.mark.parametrize("frequency_hz", [1.0, 5.0, 10.0, 20.0])
+@pytest.mark.parametrize("share", [0.05, 0.5, 1.0])
+def test_triangles_are_not_as_quick_as_their_corners(frequency_hz, share):
+    """Between the corners nothing but rounding errors is beside a straight line."""
+    time_s = np.arange(8000) / 1000.0
+    sine_of = np.sin(2.0 * np.pi * frequency_hz * time_s)
+    triangle_um = share * 100.0 / np.pi * np.arcsin(sine_of)
+    assert spectrum(triangle_um, 1000.0, 100.0, 2.0).main_hz <= 1.2 * frequency_hz + 5.0

@@ -11,7 +11,7 @@ import numpy as np
 from hilctl.analysis.steady_state import steady_part, steady_samples
 from hilctl.base.errors import DataError, RunError
 from hilctl.base.segments import Segment
-from hilctl.base.types import F64
+from hilctl.base.types import C128, F64
 from hilctl.lab.response.frequency_response import (
     FrequencyResponse,
     NoisyResponseError,
@@ -162,7 +162,7 @@ class LoopMetrics:
     low_um: float  # lowest displacement of the average cycle
     high_um: float  # highest
     hysteresis_percent: float | None  # peak hysteresis; None if the loop has no two branches
-    scatter_percent: float  # rms difference of cycles beyond noise, of the peak-to-peak
+    scatter_percent: float  # rms difference of a cycle from the next, of the peak-to-peak
     command: F64  # float64[m], the average cycle's command
     displacement_um: F64  # float64[m], its displacement
 
@@ -185,16 +185,8 @@ def loop_metrics(recording: Recording, segment: Segment) -> LoopMetrics:
     _refuse_saturated(part.samples.displacement_um, segment.label)
     command, displacement_um = part.cycle.signals
     low_um, high_um = float(displacement_um.min()), float(displacement_um.max())
-    average = np.interp(
-        np.mod(part.samples.index - segment.start, segment.period) / segment.period,
-        part.cycle.phase,
-        displacement_um,
-        period=1.0,
-    )
-    count = max(part.cycles, 1)
-    cycle_of = (np.arange(average.size) * count) // average.size
-    off = part.samples.displacement_um - average
-    means = np.bincount(cycle_of, off) / np.bincount(cycle_of)
+    since = part.samples.index - segment.start
+    each = each_cycle(since, segment.period, part.samples.displacement_um, max(part.cycles, 1))
     return LoopMetrics(
         label=segment.label,
         amplitude=0.5 * float(np.ptp(command)),
@@ -203,10 +195,21 @@ def loop_metrics(recording: Recording, segment: Segment) -> LoopMetrics:
         low_um=low_um,
         high_um=high_um,
         hysteresis_percent=cycle_metrics.peak_hysteresis_percent(command, displacement_um),
-        scatter_percent=100.0 * float(np.std(means)) / max(high_um - low_um, 1e-12),
+        scatter_percent=100.0 * _scatter_um(each) / max(high_um - low_um, 1e-12),
         command=command,
         displacement_um=displacement_um,
     )
+
+
+def _scatter_um(cycles: C128) -> float:
+    """Return the rms difference of a cycle from the next in the second half, over sqrt(2).
+
+    ``cycles`` are the Fourier coefficients of each, complex128[cycles, k]. The first cycles of a
+    sound actuator differ too: after a motion the mean of small ones creeps and accommodates.
+    """
+    steps = np.diff(cycles[len(cycles) // 2 :], axis=0)
+    power_um2 = np.abs(steps[:, 0]) ** 2 + 2.0 * np.sum(np.abs(steps[:, 1:]) ** 2, axis=1)
+    return float(np.sqrt(0.5 * power_um2.mean())) if len(steps) else 0.0
 
 
 def centre_line(loop: LoopMetrics) -> F64:
