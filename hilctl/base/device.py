@@ -5,9 +5,9 @@ Devices implement :class:`Device` in ``hilctl_drivers`` or in other packages;
 """
 
 import math
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
-from typing import Any, ClassVar, NamedTuple, Protocol, runtime_checkable
+from typing import Any, ClassVar, NamedTuple, Protocol, TypeAlias, runtime_checkable
 
 from hilctl.base.calibration import NamedCalibration
 from hilctl.base.errors import InputError
@@ -346,6 +346,90 @@ class ReadableDevice(Protocol):
                 wrongly.
         """
         ...
+
+
+class JointDevice(Protocol):
+    """Devices that share hardware, exchanged at once.
+
+    It opens and closes all of them. While it is open, the other methods of each device (``output``,
+    ``arm``, ``make_safe``, ...) and its attributes work as if the device itself had been opened;
+    :meth:`Device.make_safe` also works after :meth:`close`.
+
+    Attributes:
+        axes: Names of the axes of its devices, in the order of their blocks.
+        max_rate_hz: Highest sample rate it can keep.
+        rate_note: Reason for ``max_rate_hz`` in words; may be empty.
+    """
+
+    axes: Sequence[str]
+    max_rate_hz: float
+    rate_note: str
+
+    def check_rate(self, sample_rate_hz: float, block: int) -> None:
+        """Reject a rate that the devices cannot keep together; see :meth:`Device.check_rate`."""
+        ...
+
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """Open all devices; see :meth:`Device.open`. After an error none is open."""
+        ...
+
+    def exchange(
+        self,
+        first_sample: int,
+        commands: Sequence[F64],
+        displacements_um: Sequence[F64],
+        measured: Sequence[F64],
+    ) -> None:
+        """Send a block of commands to each device and read its displacements at once.
+
+        Each sequence holds a float64[block] per axis; see :meth:`Device.exchange`. If a command is
+        invalid, nothing was sent to any device.
+
+        Raises:
+            DeviceError: A device rejected its commands or did not answer.
+        """
+        ...
+
+    def close(self) -> None:
+        """Close all devices and leave their outputs unchanged. May be called twice."""
+        ...
+
+
+@runtime_checkable
+class JoinableDevice(Protocol):
+    """A device that may share hardware with others."""
+
+    def join(self, devices: "Mapping[str, Device]") -> JointDevice | None:
+        """Return the joint exchange of this device and those that share its hardware; no I/O.
+
+        Args:
+            devices: Devices that are not open, by name of their axes: this one first. A device of
+                another package is a proxy that has the same attributes.
+
+        Returns:
+            None if this device is exchanged on its own.
+        """
+        ...
+
+
+Units: TypeAlias = Mapping[tuple[str, ...], Device | JointDevice]
+"""What is opened, exchanged in turn, and closed, by the names of its axes."""
+
+
+def joined(devices: Mapping[str, Device]) -> Units:
+    """Return the units of a run: devices, and joint devices of those that share hardware."""
+    left = dict(devices)
+    units: dict[tuple[str, ...], Device | JointDevice] = {}
+    while left:
+        name, device = next(iter(left.items()))
+        joint = None
+        if len(left) > 1 and isinstance(device, JoinableDevice):
+            joint = device.join(left)
+        axes = (name,) if joint is None else tuple(joint.axes)
+        units[axes] = device if joint is None else joint
+        for each in axes:
+            del left[each]
+    return units
 
 
 @runtime_checkable

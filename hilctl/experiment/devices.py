@@ -15,7 +15,7 @@ from functools import wraps
 from importlib.metadata import entry_points
 from pathlib import Path
 from pkgutil import resolve_name
-from typing import Any, NamedTuple, cast
+from typing import Any, NamedTuple
 
 from hilctl.base.alarm import time_limit
 from hilctl.base.device import Device, DeviceInfo, VoltageLimit, complete
@@ -88,15 +88,18 @@ def _worded(error: BaseException) -> str:
     return f"{type(error).__name__}: {error}"
 
 
-_METHODS = ("check_rate", "open", "output", "exchange", "make_safe", "close")
-_MORE_METHODS = ("arm", "look", "set_digital", "read_digital")
+_METHODS = (
+    "arm", "check_rate", "close", "exchange", "join", "look", "make_safe", "open", "output",
+    "read_digital", "set_digital",
+)  # fmt: skip
+_NOTHING_MOVED = ("check_rate", "join")
 
 
-def _contained(kind: str, device: Device) -> Device:
+def _contained(kind: str, device: Any) -> Any:
     """Return a device whose methods raise DeviceError for whatever those of ``device`` raise.
 
-    ``check_rate`` raises InputError, because nothing has moved. The device's own calls of its
-    methods are left alone.
+    ``check_rate`` and ``join`` raise InputError, because nothing has moved. The device's own calls
+    of its methods are left alone. A joint device is contained as well.
     """
 
     def contained(name: str) -> Callable[..., Any]:
@@ -105,22 +108,21 @@ def _contained(kind: str, device: Device) -> Device:
         @wraps(method)
         def call(*given: object) -> Any:
             try:
-                return method(*given)
+                found = method(*given)
             except HilctlError:
                 raise
             except (Exception, SystemExit) as error:
                 text = f"{kind}: {name} of {known_devices().get(kind)} failed: {_worded(error)}"
-                raise (InputError if name == "check_rate" else DeviceError)(text) from error
+                raise (InputError if name in _NOTHING_MOVED else DeviceError)(text) from error
+            return _contained(kind, found) if name == "join" and found is not None else found
 
         return staticmethod(call)
 
-    members: dict[str, Any] = {
-        name: contained(name) for name in _METHODS + _MORE_METHODS if hasattr(device, name)
-    }
+    members: dict[str, Any] = {name: contained(name) for name in _METHODS if hasattr(device, name)}
     members["__getattr__"] = lambda _, name: getattr(device, name)
     members["__setattr__"] = lambda _, name, value: setattr(device, name, value)
     # Methods of the class: protocols look for them there.
-    return cast(Device, type(type(device).__name__, (), members)())
+    return type(type(device).__name__, (), members)()
 
 
 def made_device(document: Document, folder: Path, files: TextFiles) -> Device | None:

@@ -4,12 +4,12 @@ A chain has no clock: the loop calls it block by block in each phase of the run.
 """
 
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from typing import cast
 
 import numpy as np
 
-from hilctl.base.device import AgingDevice, Device
+from hilctl.base.device import AgingDevice, Device, JointDevice
 from hilctl.base.events import LOST_READINGS, OFFSET, ZERO, Event
 from hilctl.base.samples import ANSWERS, BlockHeader, Flag
 from hilctl.base.types import F64, U32
@@ -191,17 +191,25 @@ class AxisChain:
 
     def exchange(self, first_sample: int, deadline_ns: int, now_ns: Callable[[], int]) -> None:
         """Exchange the block with the device."""
-        sent, in_flight = self.block, self._in_flight
-        early = len(in_flight) <= self._latency_blocks
-        answered = sent if early else in_flight[0]
-        head, before_ns = sent.head, now_ns()
+        command, before_ns = self.block.command, now_ns()
+        answered = self.begin_exchange(before_ns - deadline_ns)
+        self.device.exchange(first_sample, command, answered.displacement_um, answered.measured)
+        self.end_exchange(answered, now_ns() - before_ns)
+
+    def begin_exchange(self, late_ns: int) -> Block:
+        """Write the lateness of an exchange; return the block whose answer it brings."""
+        head, in_flight = self.block.head, self._in_flight
         # The wake-up alone would not show a delay due to the work of this tick.
-        head[_LATE_NS] = max(head[_LATE_NS], before_ns - deadline_ns)
-        device = self.device
-        device.exchange(first_sample, sent.command, answered.displacement_um, answered.measured)
-        head[_EXCHANGE_NS] = now_ns() - before_ns
+        head[_LATE_NS] = max(head[_LATE_NS], late_ns)
+        return self.block if len(in_flight) <= self._latency_blocks else in_flight[0]
+
+    def end_exchange(self, answered: Block, duration_ns: int) -> None:
+        """Write the duration of an exchange, and the readings that the device has as attributes."""
+        in_flight = self._in_flight
+        self.block.head[_EXCHANGE_NS] = duration_ns
         for name in self._attributes:
-            getattr(answered, name)[:] = getattr(device, name)
+            getattr(answered, name)[:] = getattr(self.device, name)
+        early = len(in_flight) <= self._latency_blocks
         self._answered = None if early else in_flight.popleft()
 
     def take(self) -> bool:
@@ -342,6 +350,28 @@ class AxisChain:
         # Last: it adds the adapted offset and gain, and adapts to the input without them.
         if plan.adaptation is not None:
             plan.adaptation.follow(input_um, self._size)
+
+
+class JointChains:
+    """Chains whose devices are exchanged at once."""
+
+    def __init__(self, joint: JointDevice, chains: Sequence[AxisChain]) -> None:
+        self._joint, self._chains = joint, chains
+
+    def exchange(self, first_sample: int, deadline_ns: int, now_ns: Callable[[], int]) -> None:
+        """Exchange the block of each chain; all get the same lateness and duration."""
+        chains, before_ns = self._chains, now_ns()
+        late_ns = before_ns - deadline_ns
+        answered = [each.begin_exchange(late_ns) for each in chains]
+        self._joint.exchange(
+            first_sample,
+            [each.block.command for each in chains],
+            [each.displacement_um for each in answered],
+            [each.measured for each in answered],
+        )
+        duration_ns = now_ns() - before_ns
+        for chain, block in zip(chains, answered, strict=True):
+            chain.end_exchange(block, duration_ns)
 
 
 def _has(device: Device) -> dict[str, bool]:

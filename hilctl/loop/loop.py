@@ -10,15 +10,15 @@ the ramp the loop repeats the safe value until the last answer has arrived.
 """
 
 import math
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from enum import Enum
 from typing import cast
 
-from hilctl.base.device import Device, DigitalDevice, WatchdogDevice
+from hilctl.base.device import Device, DigitalDevice, JointDevice, Units, WatchdogDevice
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import OFFSET, TRIGGERED, Event
 from hilctl.base.samples import Flag
-from hilctl.loop.chain import AxisChain
+from hilctl.loop.chain import AxisChain, JointChains
 from hilctl.loop.pacer import Lateness, Pacer
 from hilctl.loop.plan import Host, LoopPlan
 from hilctl.loop.safe_output import (
@@ -49,9 +49,18 @@ _ARM_MARGIN_NS = 1_000_000  # arming too early costs nothing; too late, it delay
 
 
 class Loop:
-    """Run one plan on its open devices, one per axis, in a host."""
+    """Run one plan on its open devices, one per axis, in a host.
 
-    def __init__(self, plan: LoopPlan, devices: Sequence[Device], host: Host) -> None:
+    Devices are exchanged in turn, those of a joint device in ``units`` at once.
+    """
+
+    def __init__(
+        self,
+        plan: LoopPlan,
+        devices: Sequence[Device],
+        host: Host,
+        units: Units | None = None,
+    ) -> None:
         period_ns = plan.block / plan.sample_rate_hz * 1e9
         self._plan = plan
         self._devices = devices
@@ -64,6 +73,7 @@ class Loop:
             )
             for axis, device, lane in zip(plan.axes, devices, host.lanes, strict=True)
         ]  # fmt: skip
+        self._exchanges = _exchanges(self._chains, units or {})
         self._controlled = [each for each in self._chains if each.plan.feedback is not None]
         self._adapts = any(each.plan.adaptation is not None for each in self._chains)
         self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
@@ -289,8 +299,8 @@ class Loop:
         if due:
             self._ended_at = self._next_sample
         before_ns = now_ns()
-        for chain in chains:
-            chain.exchange(first_sample, deadline_ns, now_ns)
+        for exchange in self._exchanges:
+            exchange(first_sample, deadline_ns, now_ns)
         pulses, active = self._pulses, self._phase is _FOLLOWING
         if pulses is not None and pulses.follow(first_sample, active=active):
             chains[0].block.flags |= _TRIGGER
@@ -405,3 +415,18 @@ class Loop:
 
     def _sleep(self, wait_s: float) -> None:
         self._clock.sleep_until_ns(self._clock.now_ns() + round(wait_s * 1e9))
+
+
+def _exchanges(
+    chains: Sequence[AxisChain], units: Units
+) -> list[Callable[[int, int, Callable[[], int]], None]]:
+    """Return the exchanges of a tick; a joint one takes the place of its first axis."""
+    by_name = {each.plan.name: each for each in chains}
+    exchanges = {name: each.exchange for name, each in by_name.items()}
+    for names, unit in units.items():
+        if len(names) > 1:
+            members = [by_name[each] for each in names]
+            exchanges[names[0]] = JointChains(cast(JointDevice, unit), members).exchange
+            for each in names[1:]:
+                del exchanges[each]
+    return [*exchanges.values()]

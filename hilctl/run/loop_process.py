@@ -9,14 +9,14 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Sequence
+from collections.abc import Collection, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.device import Clock, Device
+from hilctl.base.device import Clock, Device, JointDevice, Units, joined
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.segments import Segment
@@ -164,15 +164,16 @@ def run_job(job: Job, rings: Sequence[SampleRing]) -> LoopOutcome:
     loaded = [loaded_of(each) for each in job.axes]
     config, page = loaded[0].config, rings[0].page
     devices = [each.device for each in loaded]
+    units = joined({each.axis: each.device for each in loaded})
     host = RingHost(rings, SystemClock(), job.supervisor, job.silence_s)
     plan = plan_of(job, loaded)
-    loop = Loop(plan, devices, host)
+    loop = Loop(plan, devices, host, units)
     # After the warm-up, so that all its memory is locked; before a device is opened, so that a
     # refusal moves nothing.
     steps = prepare(config.realtime)
     if config.realtime.require:
         require(steps)
-    start_ns = _start(loop, loaded, rings, host, steps)
+    start_ns = _start(loop, loaded, units, rings, host, steps)
     try:
         if not plan.waits:  # until it starts, arming and readings are no hang
             page.publish(PageField.PHASE, Phase.RUNNING)
@@ -185,7 +186,7 @@ def run_job(job: Job, rings: Sequence[SampleRing]) -> LoopOutcome:
         _make_safe(job, devices, rings, error)
         raise
     finally:
-        close_all(devices)
+        close_all(units.values())
         page.leave_lateness(loop.lateness)
     return outcome
 
@@ -193,6 +194,7 @@ def run_job(job: Job, rings: Sequence[SampleRing]) -> LoopOutcome:
 def _start(
     loop: Loop,
     loaded: Sequence[LoadedExperiment],
+    units: Units,
     rings: Sequence[SampleRing],
     host: RingHost,
     steps: Sequence[SetUpStep],
@@ -206,11 +208,11 @@ def _start(
     known = [each.info.details for each in devices]
     page.publish(PageField.AWAITS_DEVICE, 1)
     _await(PageField.HAS_DEVICE, page, host)
-    opened: list[Device] = []
+    opened: list[Device | JointDevice] = []
     try:
-        for device in devices:
-            device.open(config.sample_rate_hz, config.block)
-            opened.append(device)
+        for unit in units.values():
+            unit.open(config.sample_rate_hz, config.block)
+            opened.append(unit)
         outputs = [starting_output(each.device, each.config.safe.at_start) for each in loaded]
         waveform_at = loop.begin_at(outputs)
         fifo = any(each.name == "fifo" and each.outcome == "done" for each in steps)
@@ -232,11 +234,11 @@ def _start(
         raise
 
 
-def close_all(devices: Sequence[Device]) -> None:
+def close_all(units: Collection[Device | JointDevice]) -> None:
     """Close devices; the error of one does not keep the others open."""
     with ExitStack() as stack:
-        for device in reversed(devices):
-            stack.callback(device.close)
+        for unit in units:
+            stack.callback(unit.close)
 
 
 def _make_safe(

@@ -4,7 +4,7 @@ Check, loop, compensator, limiter, interlocks and recorder are those of a paced 
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import replace
 from functools import partial
 from pathlib import Path
@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.base.alarm import PATIENCE_S, alarm, time_limit
-from hilctl.base.device import Clock, Device
+from hilctl.base.device import Clock, Device, JointDevice, Units, joined
 from hilctl.base.errors import DeviceError, HilctlError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, Samples
@@ -214,17 +214,18 @@ def _run(run: CheckedRun, recorders: Sequence[Recorder]) -> tuple[LoopOutcome, L
         stop=refused,
     )
     devices = [each.loaded.device for each in run.axes]
+    units = joined(dict(zip(run.names, devices, strict=True)))
     at_start = [each.loaded.config.safe.at_start for each in run.axes]
     try:
-        loop, waveform_at = _opened(plan, devices, host, at_start)
+        loop, waveform_at = _opened(plan, devices, units, host, at_start)
         start_unix_ns = time.time_ns()
         for recorder in recorders:
             recorder.begin(start_unix_ns, {"paced": "false"}, waveform_at)
     except HilctlError:
-        _closed(devices)
+        _closed(units.values())
         discard_all(recorders)
         raise
-    return _drive(loop, devices, host)
+    return _drive(loop, units, host)
 
 
 def run_in_memory(plan: LoopPlan, devices: Sequence[Device]) -> tuple[LoopOutcome, list[Samples]]:
@@ -242,8 +243,9 @@ def run_in_memory(plan: LoopPlan, devices: Sequence[Device]) -> tuple[LoopOutcom
         on_batch=[partial(collect, parts=each) for each in lanes],
         on_event=[lambda event: None for _ in lanes],
     )
-    loop, waveform_at = _opened(plan, devices, host, [None] * len(devices))
-    outcome, _ = _drive(loop, devices, host)
+    units = joined(dict(zip((each.name for each in plan.axes), devices, strict=True)))
+    loop, waveform_at = _opened(plan, devices, units, host, [None] * len(devices))
+    outcome, _ = _drive(loop, units, host)
     return outcome, [_joined(parts, waveform_at) for parts in lanes]
 
 
@@ -257,44 +259,43 @@ def _joined(parts: list[Samples], waveform_at: int) -> Samples:
 def _opened(
     plan: LoopPlan,
     devices: Sequence[Device],
+    units: Units,
     host: OfflineHost,
     at_start: Sequence[float | None],
 ) -> tuple[Loop, int]:
     """Open the devices; return the loop, and the number of samples before the waveform."""
-    loop = Loop(plan, devices, host)
-    opened: list[Device] = []
+    loop = Loop(plan, devices, host, units)
+    opened: list[Device | JointDevice] = []
     try:
         with time_limit():
-            for device in devices:
-                device.open(plan.sample_rate_hz, plan.block)
-                opened.append(device)
+            for unit in units.values():
+                unit.open(plan.sample_rate_hz, plan.block)
+                opened.append(unit)
             return loop, loop.begin_at([*map(starting_output, devices, at_start)])
     except HilctlError:
         _closed(opened)
         raise
 
 
-def _drive(
-    loop: Loop, devices: Sequence[Device], host: OfflineHost
-) -> tuple[LoopOutcome, Lateness]:
+def _drive(loop: Loop, units: Units, host: OfflineHost) -> tuple[LoopOutcome, Lateness]:
     try:
         with alarm(host.check_exchange, PATIENCE_S):
             outcome = loop.run(0)
     finally:
-        failed = _closed(devices)
+        failed = _closed(units.values())
         host.flush()
     if failed:
         outcome = replace(outcome, code="fault", reason=f"{outcome.reason}; then {failed}")
     return outcome, loop.lateness
 
 
-def _closed(devices: Sequence[Device]) -> str:
+def _closed(units: Iterable[Device | JointDevice]) -> str:
     """Close devices; return why that failed, or an empty text."""
     failed = []
-    for device in devices:
+    for unit in units:
         try:
             with time_limit():
-                device.close()
+                unit.close()
         except DeviceError as error:
             failed.append(str(error))
     return "; ".join(failed)

@@ -1,8 +1,11 @@
 """Several axes in one loop; test_loop.py tests one axis in all phases."""
 
+from dataclasses import dataclass
+
 import numpy as np
 import pytest
 
+from hilctl.base.device import joined
 from hilctl.base.errors import DeviceError
 from hilctl.base.samples import BlockHeader, Flag
 from hilctl.loop.compensator import Compensator
@@ -20,7 +23,9 @@ SINE = np.sin(2.0 * np.pi * 5.0 * np.arange(400) / RATE_HZ)
 class Stage:
     """A loop of two axes, to be run once."""
 
-    def __init__(self, *devices, block=1, axes=(0, 1), ramps_per_s=(100.0, 40.0), models=None):
+    def __init__(
+        self, *devices, block=1, axes=(0, 1), ramps_per_s=(100.0, 40.0), models=None, join=False
+    ):
         self.devices, self.clock = devices, FakeClock()
         models = models or [terfenol_rdpi(), None]
         plans, self.lanes = [], []
@@ -44,10 +49,11 @@ class Stage:
         self.host = FakeHost(self.clock)
         self.host.lanes = self.lanes
         latency = getattr(devices[0], "latency", 0)
-        plan = LoopPlan(
+        self.plan = LoopPlan(
             axes=tuple(plans), block=block, latency_blocks=latency, sample_rate_hz=RATE_HZ
         )
-        self.loop = Loop(plan, devices, self.host)
+        units = joined(dict(zip("xyz", devices, strict=False))) if join else None
+        self.loop = Loop(self.plan, devices, self.host, units)
 
     def run(self):
         self.loop.begin_at([each.output() for each in self.devices])
@@ -131,4 +137,74 @@ def test_a_lost_device_leaves_the_other_one_safe(lost):
         # x is exchanged first: its answer has arrived when y is lost.
         answered = axis == 0 and lost == 1
         assert [int(bool(each)) for each in unanswered[-2:]] == [0, int(not answered)]
+        assert lane.heads[-1][BlockHeader.FIRST_SAMPLE] == 150
+
+
+@dataclass
+class Together:
+    """The joint of two devices, whose exchange takes 3 us."""
+
+    devices: list
+    axes: list
+    clock: FakeClock = None
+    max_rate_hz = 1000.0
+    rate_note = ""
+
+    def exchange(self, first_sample, *blocks):
+        for device, *each in zip(self.devices, *blocks, strict=True):
+            device.exchange(first_sample, *each)
+        self.clock.now += 3000
+
+
+class JoinableDevice(FakeDevice):
+    """A device that joins all others of its class."""
+
+    def join(self, devices):
+        found = {name: each for name, each in devices.items() if isinstance(each, JoinableDevice)}
+        self.joint = Together([*found.values()], [*found])
+        return self.joint if len(found) > 1 else None
+
+
+def test_joined_devices_are_exchanged_at_once_with_the_results_of_devices_in_turn():
+    one, other = JoinableDevice(), JoinableDevice()
+    stage = Stage(one, other, join=True)
+    one.joint.clock = stage.clock
+    assert stage.run().code == "completed"
+    in_turn = Stage(FakeDevice(), FakeDevice())
+    in_turn.run()
+    for axis in (0, 1):
+        for row in range(6):
+            both = (each.lanes[axis].column(row) for each in (stage, in_turn))
+            np.testing.assert_array_equal(*both)
+    late_ns, exchange_ns = BlockHeader.LATE_NS, BlockHeader.EXCHANGE_NS
+    for x, y in zip(*(lane.heads for lane in stage.lanes), strict=True):
+        assert (x[late_ns], x[exchange_ns]) == (y[late_ns], y[exchange_ns]) == (0, 3000)
+
+
+def test_devices_that_share_nothing_stay_on_their_own():
+    x, y, z = JoinableDevice(), FakeDevice(), JoinableDevice()
+    units = joined({"x": x, "y": y, "z": z})
+    assert [*units] == [("x", "z"), ("y",)]
+    assert units["x", "z"].devices == [x, z]
+    assert joined({"x": x, "y": y}) == {("x",): x, ("y",): y}
+
+
+@pytest.mark.parametrize("latency", [0, 3])
+def test_a_lost_joint_device_leaves_all_its_outputs_safe(latency):
+    class Lost(Together):
+        def exchange(self, first_sample, *blocks):
+            if first_sample >= 150:
+                raise DeviceError("no answer")
+            super().exchange(first_sample, *blocks)
+
+    made = [devices(1, latency), devices(1, latency)]
+    stage = Stage(*made)
+    joint = Lost(made, ["x", "y"], stage.clock)
+    stage.loop = Loop(stage.plan, made, stage.host, {("x", "y"): joint})
+    outcome = stage.run()
+    assert (outcome.code, outcome.output) == ("fault", "set")
+    for axis, lane in enumerate(stage.lanes):
+        assert made[axis].made_safe[-1] == 0.5 * axis
+        unanswered = np.concatenate(lane.flags) & Flag.UNANSWERED
+        assert np.count_nonzero(unanswered) == 1 + latency
         assert lane.heads[-1][BlockHeader.FIRST_SAMPLE] == 150
