@@ -27,8 +27,8 @@ from hilctl_drivers.dac import ModbusStream
 from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
-from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.options import EmulatorOptions, RigOptions
+from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WiredRig, WriteLog
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.transport.links import LostError, NoAnswerError
@@ -429,16 +429,24 @@ class InProcess:
     """An emulated device in the caller's process, with virtual time; close its log at the end."""
 
     device: EmulatedModbus
-    rig: Rig
+    rigs: tuple[WiredRig, ...]
     link: InProcessLink
     time: VirtualTime
     log: WriteLog
 
     @classmethod
     def of(
-        cls, profile, *, link=InProcessLink, log=None, message_s=0.0, noise=False, current_a=0.0
+        cls,
+        profile,
+        *,
+        link=InProcessLink,
+        log=None,
+        message_s=0.0,
+        noise=False,
+        current_a=0.0,
+        rigs=1,
     ):
-        """Return an emulated device with the first output and input of a Modbus profile.
+        """Return an emulated device with the first outputs and inputs of a Modbus profile.
 
         Args:
             profile: Name of a shipped profile, or a path.
@@ -447,17 +455,18 @@ class InProcess:
             message_s: Duration of a request and its reply.
             noise: Whether the sensor has noise.
             current_a: Initial current; the power-up value if None.
+            rigs: Rigs, each with an output and an input.
         """
         loaded = load_profile(profile)
-        output, sensor = next(iter(loaded.outputs)), next(iter(loaded.inputs))
-        time = VirtualTime()
-        actuator = SimulatedTerfenol(TerfenolOptions(noise=noise))
-        rig, writes = Rig(time.now_ns, actuator), WriteLog(log, 0)
-        wiring = SimulatedWiring.spread(loaded.outputs[output], loaded.inputs[sensor], actuator)
-        bench = Bench(rig, wiring, writes)
-        device = EmulatedModbus(loaded, bench, output, sensor, current_a)
+        time, writes = VirtualTime(), WriteLog(log, 0)
+        driven, shown = {}, {}
+        for output, sensor, _ in zip(loaded.outputs, loaded.inputs, range(rigs), strict=False):
+            actuator = SimulatedTerfenol(TerfenolOptions(noise=noise))
+            wiring = SimulatedWiring.spread(loaded.outputs[output], loaded.inputs[sensor], actuator)
+            driven[output] = shown[sensor] = WiredRig(Rig(time.now_ns, actuator), wiring)
+        device = EmulatedModbus(loaded, Bench(driven, shown, writes), current_a)
         wire = ModbusWire("tcp", {loaded.unit_id: device})
-        return cls(device, rig, link(wire, time, message_s), time, writes)
+        return cls(device, tuple(driven.values()), link(wire, time, message_s), time, writes)
 
     def stream(self, options):
         """Return a modbus_stream on this device and in its time."""
@@ -467,9 +476,14 @@ class InProcess:
         return device
 
     @property
+    def rig(self):
+        """Its first rig."""
+        return self.rigs[0].rig
+
+    @property
     def options(self):
         """The options of a device that drives this one without a watchdog."""
-        wiring, profile = self.device.wiring, self.device.profile
+        wiring, profile = self.rigs[0].wiring, self.device.profile
         return {
             "host": "127.0.0.1",
             "output": next(iter(profile.outputs)),
@@ -478,6 +492,11 @@ class InProcess:
             "sensor": wiring.sensor.model_dump(),
             "watchdog": "none",
         }
+
+
+def one_rig(**options) -> tuple[RigOptions, ...]:
+    """Return the options of an emulator's only rig."""
+    return (RigOptions(**options),)
 
 
 @contextmanager

@@ -18,7 +18,7 @@ from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from hilctl_drivers.simulated.devices import PiezoOptions, TerfenolOptions
-from tests.fakes import ManualClock, emulated
+from tests.fakes import ManualClock, emulated, one_rig
 
 SETTLED_NS = 2_000_000
 """What the emulated rig takes to settle, 0.1 ms, many times over: it computes each sample of it."""
@@ -80,7 +80,9 @@ def modbus(words, stack):
     clock = ManualClock()
     actuator = PiezoOptions() if words[-1] == "V" else TerfenolOptions()
     name, reader, line = [*(word for word in words if word != "V"), None, None][:3]
-    wanted = EmulatorOptions(name, reader=reader, reader_line=line, actuator=actuator, command=0.0)
+    wanted = EmulatorOptions(
+        name, reader=reader, reader_line=line, rigs=one_rig(actuator=actuator), command=0.0
+    )
     emulator = stack.enter_context(emulated(wanted, clock))
     chosen = device_class("modbus_dac")
     options = _fast({**emulator.options, "timeout_s": TIMEOUT_S})
@@ -93,7 +95,7 @@ def modbus(words, stack):
         clock.now_ns += min(round(1e9 / rate_hz), SETTLED_NS)
 
     return DrivenDevice(
-        device, 1, rate_hz, lambda: emulator.device._rig.command, pass_time, name="modbus_dac"
+        device, 1, rate_hz, lambda: emulator.rigs[0].rig.command, pass_time, name="modbus_dac"
     )
 
 

@@ -18,7 +18,7 @@ from hilctl_drivers.contract import *  # noqa: F403  the checks, and the fixture
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from hilctl_drivers.simulated.devices import PiezoOptions, TerfenolOptions
-from tests.fakes import ManualClock, emulated
+from tests.fakes import ManualClock, emulated, one_rig
 
 SERIAL = (
     "adam_4024_ascii agilent_34970a own", "adam_4024_ascii only_reads same", "agilent_34970a",
@@ -122,7 +122,9 @@ def wired(case, tmp_path, stack):
     stream = getattr(profile, "exchange", "none") == "stream"
     unasked = case == UNASKED
     clock = time.monotonic_ns if stream or unasked else ManualClock()
-    wanted = EmulatorOptions(str(path), reader=reader, reader_line=line, actuator=actuator)
+    wanted = EmulatorOptions(
+        str(path), reader=reader, reader_line=line, rigs=one_rig(actuator=actuator)
+    )
     emulator = stack.enter_context(emulated(wanted, clock))
     options = {**emulator.options, "timeout_s": TIMEOUT_S, "fifo_blocks": FIFO_BLOCKS}
     chosen = device_class("serial_dac")
@@ -130,7 +132,7 @@ def wired(case, tmp_path, stack):
     stack.callback(device.close)
     rate_hz = STREAM_RATE_HZ if stream else device.info.max_rate_hz
     silent = getattr(profile.outputs[options["output"]], "reply", "") == "none"
-    rig = emulator.device._rig
+    rig = emulator.rigs[0].rig
 
     def pass_time():
         if unasked:

@@ -17,7 +17,7 @@ import pytest
 from hilctl_drivers.emulator.factory import Emulator
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.simulated.devices import TerfenolOptions
-from tests.fakes import ManualClock, emulated
+from tests.fakes import ManualClock, emulated, one_rig
 
 BAUD = 115_200
 
@@ -229,7 +229,7 @@ class Emulated:
     def __init__(self, emulator: Emulator, clock: ManualClock) -> None:
         self.emulator = emulator
         self._clock = clock
-        self.rig = emulator.device._rig
+        self.rig = emulator.rigs[0].rig
         host, _, port = emulator.address.partition(":")
         self.where = {"host": host, "port": int(port)} if port else {"serial_port": host}
 
@@ -245,7 +245,9 @@ def emulate() -> Iterator[Callable[[str], Emulated]]:
 
         def start(profile: str) -> Emulated:
             clock = ManualClock()
-            options = EmulatorOptions(profile, actuator=TerfenolOptions(noise=False), command=0.0)
+            options = EmulatorOptions(
+                profile, rigs=one_rig(actuator=TerfenolOptions(noise=False)), command=0.0
+            )
             return Emulated(stack.enter_context(emulated(options, clock)), clock)
 
         yield start

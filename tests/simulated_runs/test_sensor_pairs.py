@@ -15,7 +15,7 @@ from hilctl.experiment.devices import device_class
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from hilctl_drivers.simulated.devices import TerfenolOptions
-from tests.fakes import ManualClock, ShiftedClock, emulated, logged
+from tests.fakes import ManualClock, ShiftedClock, emulated, logged, one_rig
 
 SAMPLES = 2000
 STILL = TerfenolOptions(noise=False)
@@ -105,7 +105,7 @@ class SentBlocks:
     def _keep(self, now_ns):
         data = self._block(now_ns)
         self.sent_ns.append(time.monotonic_ns())
-        self.shown_um.append(self._reader._rig.displacement_um)
+        self.shown_um.append(self._reader._wired[0].rig.displacement_um)
         return data
 
     def last_read_um(self, device, before_ns):
@@ -131,7 +131,9 @@ def test_all_commands_and_readings_are_those_of_the_devices(profile, tmp_path, n
     streams = name == "text with a stream"
     log, clock = tmp_path / "log.jsonl", ShiftedClock() if streams else ManualClock()
     path = profile(output)
-    with emulated(EmulatorOptions(path, log=log, actuator=STILL, **options), clock) as emulator:
+    with emulated(
+        EmulatorOptions(path, log=log, rigs=one_rig(actuator=STILL), **options), clock
+    ) as emulator:
         blocks = SentBlocks(emulator.reader) if streams else None
         keys = {**emulator.options, "timeout_s": PATIENT_S}
         for section in (keys, keys.get("reader")):
@@ -151,7 +153,7 @@ def test_all_commands_and_readings_are_those_of_the_devices(profile, tmp_path, n
             device.exchange(k, sent[part], displacement_um[part], measured[part])
             device.output()  # a command without a reply has been executed then
             if blocks is None:
-                shown_um[k] = emulator.device._rig.displacement_um
+                shown_um[k] = emulator.rigs[0].rig.displacement_um
                 clock.pass_s(0.001)
             else:
                 shown_um[k] = blocks.last_read_um(device, before_ns)

@@ -21,11 +21,10 @@ class EmulatedBoard(SerialDevice):
 
     profile: FrameProfile
 
-    def __init__(
-        self, profile: FrameProfile, bench: Bench, output: str | None, sensor: str | None
-    ) -> None:
+    def __init__(self, profile: FrameProfile, bench: Bench) -> None:
         self._name, self._range = next(iter(profile.outputs.items()))
-        super().__init__(profile, bench, output, sensor)
+        super().__init__(profile, bench)
+        self._rig, self._wiring = self._wired[0].rig, self._wired[0].wiring
         self._outputs = BoardValues(self._range)
         self._inputs = BoardValues(next(iter((profile.inputs or profile.outputs).values())))
         streaming = profile.streaming
@@ -50,8 +49,8 @@ class EmulatedBoard(SerialDevice):
             self._kinds[board.STATE] = self._state
         low, high = self._range.limits
         # The power-up value is 0 at the terminal, not at the actuator.
-        self.fifo.command = self.wiring.command(min(max(0.0, low), high))
-        if output is not None:
+        self.fifo.command = self._wiring.command(min(max(0.0, low), high))
+        if self._driven:
             self._rig.put_out(self.fifo.command, 0)
 
     def _trip(self, due_ns: int) -> None:
@@ -129,7 +128,7 @@ class EmulatedBoard(SerialDevice):
             raise RejectedRequest(Status.WRONG_FIRST)
         if fifo.level + count > streaming.fifo_depth:
             raise RejectedRequest(Status.FIFO_FULL)
-        fifo.queue(self.wiring.command(values))
+        fifo.queue(self._wiring.command(values))
         if not fifo.started and fifo.level >= self._prefill:
             fifo.start(self._now_ns)
         until = max(0, self.queued - self._prefill)
@@ -186,7 +185,7 @@ class EmulatedBoard(SerialDevice):
     def _state(self, body: bytes) -> bytes:
         if body:
             raise RejectedRequest(Status.BAD_MESSAGE)
-        output = self._outputs.encode(np.array([self.wiring.output(self.fifo.command)]))
+        output = self._outputs.encode(np.array([self._wiring.output(self.fifo.command)]))
         read_um = self._played_um if self.fifo.started else self._rig.displacement_um
         reading = self._inputs.encode(self._at_terminal(np.array([read_um])))
         return board.STATE_REPLY.pack(board.StateFlag.TRIPPED * self.tripped) + output + reading
@@ -206,15 +205,15 @@ class EmulatedBoard(SerialDevice):
 
     def _put_out(self, value: float, event: str, now_ns: int) -> None:
         self._set_terminal(self._name, value, event, now_ns)
-        self.fifo.command = self.wiring.command(value)
+        self.fifo.command = self._wiring.command(value)
 
     def _played(self, first: int, command: F64, displacement_um: F64, now_ns: int) -> None:
         self._readings = np.concatenate([self._readings, displacement_um])
         self._played_um = float(displacement_um[-1])
-        self._log_played(first, command, now_ns)
+        self._log_played(self._name, first, command, now_ns)
 
     def _at_terminal(self, displacement_um: F64) -> F64:
         """Return float64[n], readings of the input; 0 if another device reads the sensor."""
-        if self._sensor is None:
+        if not self._shown:
             return np.zeros_like(displacement_um)
-        return self.wiring.at_terminal(displacement_um)
+        return self._wiring.at_terminal(displacement_um)

@@ -26,6 +26,7 @@ from hilctl_drivers.emulator.options import (
     EmulatorOptions,
     LinkKind,
     ReaderLine,
+    RigOptions,
     parse_fault,
 )
 from hilctl_drivers.emulator.rig import ACTUATORS
@@ -94,16 +95,19 @@ def wired_experiment(
             "reader_unit_id": reader.unit_id,
             "reader_port": _port(reader),
         }
-    made = EmulatorOptions(
-        profile=_found(options.profile, path.parent),
-        link=_link(options),
-        host=host or EmulatorOptions.host,
-        port=port or _port(options),
+    rig = RigOptions(
         output=options.output,
         sensor=options.input,
         actuator=_actuator(unit, actuator, document.data.get("amplifier")),
         wiring=(options.amplifier, options.sensor),
         limits=limited_range(document.data.get("limits")),
+    )
+    made = EmulatorOptions(
+        profile=_found(options.profile, path.parent),
+        link=_link(options),
+        host=host or EmulatorOptions.host,
+        port=port or _port(options),
+        rigs=(rig,),
         **of_reader,
     )
     return WiredExperiment(path, section, made)
@@ -226,11 +230,12 @@ def emulate(
     """Emulate a device with the simulated rig, until Ctrl-C."""
     wired = None
     own: dict[str, Any] = {
-        "link": link, "output": output, "sensor": sensor, "reader": reader,
-        "reader_line": reader_line, "reader_unit_id": reader_unit_id,
+        "link": link, "reader": reader, "reader_line": reader_line,
+        "reader_unit_id": reader_unit_id,
     }  # fmt: skip
     if is_experiment(profile):
-        given = [key for key, value in (own | {"unit": unit}).items() if value is not None]
+        of_rig = {"output": output, "sensor": sensor, "unit": unit}
+        given = [key for key, value in (own | of_rig).items() if value is not None]
         if given:
             names = ", ".join(f"--{key.replace('_', '-')}" for key in given)
             raise InputError(f"{names}: specified by {profile} already")
@@ -238,9 +243,9 @@ def emulate(
         options = wired.options
     else:
         if reader is None and sensor is not None and ":" in sensor:
-            own["reader"], _, own["sensor"] = sensor.rpartition(":")
-        simulated = _actuator(unit or "A", actuator or ())
-        options = EmulatorOptions(profile, host=host, port=port, actuator=simulated, **own)
+            own["reader"], _, sensor = sensor.rpartition(":")
+        rig = RigOptions(output, sensor, _actuator(unit or "A", actuator or ()))
+        options = EmulatorOptions(profile, host=host, port=port, rigs=(rig,), **own)
     faults = tuple(parse_fault(text) for text in fault or ())
     reader_port = reader_port or options.reader_port
     options = replace(options, log=log, faults=faults, command=command, reader_port=reader_port)
@@ -254,23 +259,23 @@ def _say(emulator: Emulator, *, as_json: bool, wired: WiredExperiment | None) ->
     for profile, address, unit_id in emulator.places:
         unit = f", unit {unit_id}" if unit_id is not None else ""
         typer.echo(f"{profile} answers at {address}{unit}")
-    wiring, info = emulator.device.wiring, emulator.actuator.info
-    gain, offset, um_per_unit, offset_um = wiring.factors
-    unit = wiring.command_unit
-    drive = {"A": "current", "V": "voltage"}[unit]
-    typer.echo(
-        f"{emulator.options['output']}: {drive} = {gain:g} {unit} x output {offset:+g} {unit}"
-    )
-    shown = f"{um_per_unit:g} µm x input {offset_um:+g} µm"
-    typer.echo(f"{emulator.options['input']}: displacement = {shown}")
-    limits = f"{info.command_min:g} to {info.command_max:g} {unit}"
-    typer.echo(f"{info.name}: {limits}, {info.sensor_min_um:g} to {info.sensor_max_um:g} µm")
+    for section, wired_rig in zip(emulator.sections, emulator.rigs, strict=True):
+        wiring, info = wired_rig.wiring, wired_rig.rig.actuator.info
+        gain, offset, um_per_unit, offset_um = wiring.factors
+        unit = wiring.command_unit
+        drive = {"A": "current", "V": "voltage"}[unit]
+        typer.echo(f"{section['output']}: {drive} = {gain:g} {unit} x output {offset:+g} {unit}")
+        shown = f"{um_per_unit:g} µm x input {offset_um:+g} µm"
+        typer.echo(f"{section['input']}: displacement = {shown}")
+        limits = f"{info.command_min:g} to {info.command_max:g} {unit}"
+        typer.echo(f"{info.name}: {limits}, {info.sensor_min_um:g} to {info.sensor_max_um:g} µm")
     if wired is not None:
         typer.echo(f"hilctl {shlex.join(wired.words(emulator))}")
 
 
 def _report(emulator: Emulator, wired: WiredExperiment | None) -> dict[str, Any]:
-    wiring, suffix = emulator.device.wiring, emulator.device.wiring.command_unit.lower()
+    wiring = emulator.rigs[0].wiring
+    suffix = wiring.command_unit.lower()
     names = f"gain_{suffix}", f"offset_{suffix}", "sensor_um", "offset_um"
     terminals = {key: emulator.options[key] for key in ("output", "input")}
     report = {

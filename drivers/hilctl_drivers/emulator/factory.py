@@ -1,11 +1,11 @@
-"""Factory of emulators: a device that drives the rig, and optionally another that reads it.
+"""Factory of emulators: a device that drives rigs, and optionally another that reads them.
 
 Two Modbus devices share a line, or a gateway, by unit id, and two text devices a line by address;
 or each has a port of its own, with any protocol.
 """
 
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
@@ -15,8 +15,15 @@ from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.emulator.board_device import EmulatedBoard
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
-from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLine
-from hilctl_drivers.emulator.rig import ACTUATORS, Bench, Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLine, RigOptions
+from hilctl_drivers.emulator.rig import (
+    ACTUATORS,
+    Bench,
+    Rig,
+    SimulatedWiring,
+    WiredRig,
+    WriteLog,
+)
 from hilctl_drivers.emulator.sensor_stream import EmulatedStream
 from hilctl_drivers.emulator.server import EmulatorServer
 from hilctl_drivers.emulator.text_device import EmulatedText
@@ -53,17 +60,22 @@ class Emulator:
 
     server: EmulatorServer
     log: WriteLog
-    device: AnyDevice  # drives the rig
-    reader: AnyDevice  # shows the displacement, often the same
-    actuator: SimulatedDevice
+    device: AnyDevice  # drives the rigs
+    reader: AnyDevice  # shows their displacements, often the same
+    rigs: tuple[WiredRig, ...]
     wires: tuple[EmulatedWire, ...]  # one, or the reader's too
     places: tuple[ListenAddress, ...]  # of the device, and of the reader if it is another one
-    options: dict[str, Any]  # address and wiring, as in an experiment's device section
+    sections: tuple[dict[str, Any], ...]  # address and wiring per rig, as an experiment's device
 
     @property
     def address(self) -> str:
         """Address of the device."""
         return self.places[0].address
+
+    @property
+    def options(self) -> dict[str, Any]:
+        """The device section for the first rig."""
+        return self.sections[0]
 
 
 def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns) -> Emulator:
@@ -72,8 +84,8 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
     now_ns = clock_ns()
     log = WriteLog(options.log, time.time_ns() - now_ns)
     server = EmulatorServer(options.faults, clock_ns)
-    bench = Bench(Rig(now_ns, plan.actuator), plan.wiring, log)
-    device, reader, wires = plan.devices(bench)
+    rigs = plan.rigs(now_ns)
+    device, reader, wires = plan.devices(rigs, log)
     try:
         addresses = [each.open(server, wire, options.host) for each, wire in wires]
     except InputError:
@@ -85,10 +97,10 @@ def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic
         log=log,
         device=device,
         reader=reader,
-        actuator=plan.actuator,
+        rigs=rigs,
         wires=tuple(wire for _, wire in wires),
         places=plan.listen_addresses(addresses),
-        options={**plan.channels(), **plan.places(addresses)},
+        sections=tuple({**each, **plan.places(addresses)} for each in plan.channels()),
     )
 
 
@@ -103,16 +115,24 @@ class _Plan:
             self._shown = _Served.of(options.reader, link, options.reader_port, faulty=False)
         self._profile, self._reader = profile, reader = self._served.profile, self._shown.profile
         outputs, sensors = list(profile.outputs), list(reader.sensor_inputs)
-        self._output = _chosen("output to drive the rig with", options.output, outputs, profile)
-        self._sensor = _chosen("input to show a displacement at", options.sensor, sensors, reader)
-        source = reader.inputs[self._sensor]
-        self.actuator, self.wiring = _rig(options, profile.outputs[self._output], source)
-        markers = [getattr(source, key, None) for key in ("validity", "invalid", "valid")]
         faults = {each.kind for each in options.faults}
-        if set(markers) <= {"none", None} and "invalid" in faults:
-            raise InputError(
-                f"fault invalid: {self._sensor} of {reader.title} has no validity, invalid or valid"
-            )
+        self._terminals: list[tuple[str, str]] = []  # output and input of each rig
+        self._rigs: list[tuple[SimulatedDevice, SimulatedWiring]] = []
+        for each in options.rigs:
+            output = _chosen("output to drive the rig with", each.output, outputs, profile)
+            sensor = _chosen("input to show a displacement at", each.sensor, sensors, reader)
+            source = reader.inputs[sensor]
+            markers = [getattr(source, key, None) for key in ("validity", "invalid", "valid")]
+            if set(markers) <= {"none", None} and "invalid" in faults:
+                raise InputError(
+                    f"fault invalid: {sensor} of {reader.title} has no validity, invalid or valid"
+                )
+            self._terminals.append((output, sensor))
+            self._rigs.append(_rig(each, profile.outputs[output], source))
+        for names in zip(*self._terminals, strict=True):
+            for name in names:
+                if names.count(name) > 1:
+                    raise InputError(f"{name} must not have two rigs")
         if "stall" in faults and not isinstance(reader, StreamProfile):
             raise InputError(f"fault stall: {reader.title} sends no unsolicited samples")
         self._apart = reader is not profile and not self._may_share(options.reader_line)
@@ -144,17 +164,24 @@ class _Plan:
             raise InputError(f"reader_unit_id must not be {wanted}, that of {profile.title}")
         return reader.unit_id + (reader.unit_id == profile.unit_id) if wanted is None else wanted
 
+    def rigs(self, now_ns: int) -> tuple[WiredRig, ...]:
+        """Return the rigs, at rest."""
+        return tuple(WiredRig(Rig(now_ns, actuator), wiring) for actuator, wiring in self._rigs)
+
     def devices(
-        self, bench: Bench
+        self, rigs: Sequence[WiredRig], log: WriteLog
     ) -> tuple[AnyDevice, AnyDevice, list[tuple["_Served", EmulatedWire]]]:
-        """Return the devices that drive and show the rig, and the wires to serve."""
+        """Return the devices that drive and show the rigs, and the wires to serve."""
         served, shown = self._served, self._shown
         here, unit = self._profile.usual_unit, self.reader_unit_id
+        outputs, sensors = zip(*self._terminals, strict=True)
+        driving = dict(zip(outputs, rigs, strict=True))
+        showing = dict(zip(sensors, rigs, strict=True))
         if served is shown:
-            device = self._device(self._profile, bench, self._output, self._sensor)
+            device = self._device(self._profile, Bench(driving, showing, log))
             return device, device, [(served, served.wire({here: device}))]
-        device = self._device(self._profile, bench, self._output, None)
-        reader = self._device(self._reader, bench, None, self._sensor)
+        device = self._device(self._profile, Bench(driving, {}, log))
+        reader = self._device(self._reader, Bench({}, showing, log))
         if self._apart:
             wires = served.wire({here: device}), shown.wire({unit: reader})
             return device, reader, [(served, wires[0]), (shown, wires[1])]
@@ -162,36 +189,32 @@ class _Plan:
         both = served.wire({unit: reader, here: device})
         return device, reader, [(served, both)]
 
-    def _device(
-        self, profile: BaseProfile, bench: Bench, output: str | None, sensor: str | None
-    ) -> AnyDevice:
-        options = self._options
+    def _device(self, profile: BaseProfile, bench: Bench) -> AnyDevice:
+        command = self._options.command if bench.driven else None
         if isinstance(profile, ModbusProfile):
-            return EmulatedModbus(
-                profile, bench, output, sensor, options.command if output else None
-            )
-        if options.command is not None and output is not None:
+            return EmulatedModbus(profile, bench, command)
+        if command is not None:
             raise InputError(f"initial command is for Modbus profiles, not for {profile.title}")
-        if isinstance(profile, StreamProfile) and sensor is not None:
-            return EmulatedStream(profile, bench, sensor)
+        if isinstance(profile, StreamProfile):
+            return EmulatedStream(profile, bench)
         if isinstance(profile, FrameProfile):
-            return EmulatedBoard(profile, bench, output, sensor)
+            return EmulatedBoard(profile, bench)
         assert isinstance(profile, AsciiProfile)
-        return EmulatedText(profile, bench, output, sensor)
+        return EmulatedText(profile, bench)
 
-    def channels(self) -> dict[str, Any]:
-        """Return the part of a device section with profile, channels and wiring."""
-        amplifier, sensor = self.wiring.amplifier, self.wiring.sensor
-        made: dict[str, Any] = {
-            "profile": self._options.profile,
-            "output": self._output,
-            "input": self._sensor,
-            "sensor": sensor.model_dump(exclude_none=True),
-            "watchdog": "none",
-        }
-        if amplifier is not None:
-            made["amplifier"] = amplifier.model_dump(exclude_none=True)
-        return made
+    def channels(self) -> Iterator[dict[str, Any]]:
+        """Yield the part of each rig's device section with profile, channels and wiring."""
+        for (output, source), (_, wiring) in zip(self._terminals, self._rigs, strict=True):
+            made: dict[str, Any] = {
+                "profile": self._options.profile,
+                "output": output,
+                "input": source,
+                "sensor": wiring.sensor.model_dump(exclude_none=True),
+                "watchdog": "none",
+            }
+            if wiring.amplifier is not None:
+                made["amplifier"] = wiring.amplifier.model_dump(exclude_none=True)
+            yield made
 
     def listen_addresses(self, addresses: list[str]) -> tuple[ListenAddress, ...]:
         """Return the addresses of the devices, with their unit ids if there are two."""
@@ -263,7 +286,7 @@ class _Served:
 
 
 def _rig(
-    options: EmulatorOptions, output: Range, sensor_input: Range
+    options: RigOptions, output: Range, sensor_input: Range
 ) -> tuple[SimulatedDevice, SimulatedWiring]:
     """Return the actuator and its wiring to an output and an input; each may follow the other."""
     actuator, given, limits = options.actuator, options.wiring, options.limits

@@ -1,4 +1,4 @@
-"""Stream-out and stream-in of an emulated LabJack T4 or T7: registers in front of a FIFO.
+"""Stream-out and stream-in of an emulated LabJack T4 or T7: registers in front of FIFOs.
 
 It follows :mod:`hilctl_drivers.labjack.stream`. Two behaviours are assumptions, because no document
 describes them: a trip of the watchdog ends the stream, and the order of queued sets of values.
@@ -6,16 +6,23 @@ describes them: a trip of the watchdog ends the stream, and the order of queued 
 
 import struct
 from collections.abc import Callable
+from functools import partial
 
 import numpy as np
 
 from hilctl.base.types import F64
-from hilctl_drivers.emulator.rig import Bench, SampleFifo
+from hilctl_drivers.emulator.rig import Bench, SampleFifo, WiredRig
 from hilctl_drivers.emulator.wire import RejectedRequest
 from hilctl_drivers.labjack import stream
-from hilctl_drivers.modbus.modbus_profile import BYTES_A_SAMPLE, LabJackStreaming, ModbusProfile
+from hilctl_drivers.modbus.modbus_profile import (
+    BYTES_A_SAMPLE,
+    LabJackStreaming,
+    ModbusOutput,
+    ModbusProfile,
+)
 from hilctl_drivers.modbus.register_map import RegisterStep
 
+_STREAM_OUTS = 4
 _DROPPING, _DROPPED = 2940, 2941
 _VALUE_EXCEPTION, _FAILURE_EXCEPTION = 3, 4
 _PERIOD_NS, _PERIODS_MAX = 100, 65_536
@@ -79,66 +86,128 @@ class LabJackInput:
         return whole
 
 
+class StreamedOutput:
+    """An output that the stream can change, with the rig between it and an input."""
+
+    def __init__(self, name: str, channel: ModbusOutput, sensor: int, wired: WiredRig) -> None:
+        self.name, self.sensor, self.rig, self.wiring = name, sensor, wired.rig, wired.wiring
+        self._limits = channel.limits
+        self.fifo = SampleFifo(wired.rig.actuator, repeats=True, on_played=self._played)
+        self._pending: list[F64] = []
+        self.first = 0
+        self.command, self.displacement_um = np.empty((2, 0))
+        """Commands of the scans since the last :meth:`advance`, and the readings before each."""
+
+    @property
+    def held(self) -> int:
+        """Values that wait in its buffer."""
+        return self.fifo.level + sum(part.size for part in self._pending)
+
+    def clear(self) -> None:
+        """Empty its buffer."""
+        self.fifo.clear()
+        self._pending.clear()
+
+    def take(self, values: F64) -> None:
+        """Buffer float64[n] volts until :meth:`use`; raise RejectedRequest if out of range."""
+        low, high = self._limits
+        slack = 1e-6 * (high - low)
+        good = (values >= low - slack) & (values <= high + slack)
+        _require(bool(good.all()), _VALUE_EXCEPTION)
+        self._pending.append(values)
+
+    def use(self) -> None:
+        """Let the buffered values follow those that are still to be output."""
+        for values in self._pending:
+            self.fifo.queue(self.wiring.command(values))
+        self._pending.clear()
+
+    def start(self, rate_hz: float, now_ns: int) -> None:
+        """Start scans with the present output."""
+        self.fifo.command = self.rig.command
+        self.fifo.set_rate(rate_hz)
+        self.fifo.start(now_ns)
+
+    def advance(self, now_ns: int, *, streamed: bool) -> None:
+        """Scan until a time; an output that is not in the scan list keeps its own value."""
+        if not streamed:
+            self.fifo.command = self.rig.command
+        self.command = self.displacement_um = np.empty(0)
+        self.fifo.advance(now_ns)
+
+    def _played(self, first: int, command: F64, displacement_um: F64, now_ns: int) -> None:
+        self.first, self.command, self.displacement_um = first, command, displacement_um
+
+
 class LabJackStream:
-    """The registers; ``on_played`` gets the first number, the commands, and the last time."""
+    """The registers; ``on_played`` gets an output, the first number, commands, and the time."""
 
     def __init__(
         self,
         profile: ModbusProfile,
         streaming: LabJackStreaming,
-        output: str,
-        sensor: str,
         bench: Bench,
         *,
-        on_played: Callable[[int, F64, int], None],
+        on_played: Callable[[str, int, F64, int], None],
     ) -> None:
-        self._streaming, self._wiring, self._rig = streaming, bench.wiring, bench.rig
-        self._limits = profile.outputs[output].limits
-        self._target = profile.wire_address(profile.outputs[output])
-        self._source = profile.wire_address(profile.inputs[sensor])
-        self._inputs = 1
+        self._streaming = streaming
+        self.outputs: dict[int, StreamedOutput] = {}
+        """By address; those with a rig whose input can stream too."""
+        for (name, wired), sensor in zip(bench.driven.items(), bench.shown, strict=False):
+            if name in streaming.outputs and sensor in streaming.inputs:
+                output, source = profile.outputs[name], profile.wire_address(profile.inputs[sensor])
+                made = StreamedOutput(name, output, source, wired)
+                self.outputs[profile.wire_address(output)] = made
+        self._streamed: list[StreamedOutput] = []  # in the scan list
+        self._scanned: list[int] = []  # inputs in the scan list
+        self.running = False
         self._analog = {profile.wire_address(each) for each in profile.inputs.values()}
-        self.fifo = SampleFifo(bench.rig.actuator, repeats=True, on_played=self._played)
         self._on_played = on_played
         self.input = LabJackInput(streaming)
         self._words = {address: bytes(4) for address in _plain(profile, streaming)}
-        self._pending: list[F64] = []
         self._writes: dict[int, Callable[[bytes], None]] = {
             stream.SCANRATE_HZ: self._set_rate,
-            stream.OUT_ENABLE: self._enable_output,
-            stream.OUT_BUFFER_F32: self._take_values,
-            stream.OUT_SET_LOOP: self._use_values,
             stream.ENABLE: self._enable,
         }
         self._reads: dict[int, Callable[[int], bytes]] = {
-            stream.OUT_BUFFER_STATUS: lambda count: stream.u32(self._capacity - self._held),
-            stream.ENABLE: lambda count: stream.u32(int(self.fifo.running)),
+            stream.ENABLE: lambda count: stream.u32(int(self.running)),
             stream.DATA_CR: self._data,
             stream.FLASH_READ: self._read_flash,
         }
+        for k in range(_STREAM_OUTS):
+            self._writes[stream.OUT_ENABLE + 2 * k] = partial(self._enable_output, k)
+            self._writes[stream.OUT_BUFFER_F32 + 2 * k] = partial(self._take_values, k)
+            self._writes[stream.OUT_SET_LOOP + 2 * k] = partial(self._use_values, k)
+            self._reads[stream.OUT_BUFFER_STATUS + 2 * k] = partial(self._free, k)
         self._now_ns = 0
 
     def has(self, address: int) -> bool:
         """Return whether an address belongs to the stream; inputs do while it runs."""
         known = address in self._words or address in self._reads or address in self._writes
         scanned = stream.SCANLIST_ADDRESS <= address < stream.SCANLIST_ADDRESS + 256
-        return known or scanned or (self.fifo.running and address in self._analog)
+        return known or scanned or (self.running and address in self._analog)
 
     def tick(self, now_ns: int) -> None:
         """Advance the time."""
         self._now_ns = max(self._now_ns, now_ns)
-        self.fifo.advance(self._now_ns)
-
-    def _played(self, first: int, command: F64, displacement_um: F64, now_ns: int) -> None:
-        self._on_played(first, command, now_ns)
-        volts = np.repeat(self._wiring.output(command)[:, None], self._inputs, axis=1)
-        volts[:, 0] = self._wiring.at_terminal(displacement_um)
-        self.input.keep(volts.ravel())
+        for each in self.outputs.values():
+            each.advance(self._now_ns, streamed=each in self._streamed)
+        if not self._streamed or not self._streamed[0].command.size:
+            return
+        for each in self._streamed:
+            self._on_played(each.name, each.first, each.command, self._now_ns)
+        first = self._streamed[0]
+        columns = dict.fromkeys(self._scanned, first.wiring.output(first.command))
+        for each in self.outputs.values():
+            columns[each.sensor] = each.wiring.at_terminal(each.displacement_um)
+        self.input.keep(np.column_stack([columns[each] for each in self._scanned]).ravel())
 
     def stop(self, now_ns: int) -> None:
         """Stop streaming at a time, possibly in the past; the output holds its value."""
         self.tick(now_ns)
-        self.fifo.stop()
+        self.running = False
+        for each in self.outputs.values():
+            each.fifo.stop()
 
     def read(self, address: int, count: int) -> bytes:
         """Return register words; raise RejectedRequest if they are not readable, or not now."""
@@ -156,16 +225,22 @@ class LabJackStream:
         _require(pairs.keys() <= self._words.keys(), _VALUE_EXCEPTION)
         self._words.update(pairs)
 
-    @property
-    def _capacity(self) -> int:
-        return self._number(stream.OUT_ALLOCATE_BYTES) // BYTES_A_SAMPLE
+    def _number(self, address: int, k: int = 0) -> int:
+        """Return the content of a register of two words, the k-th of its kind."""
+        return int.from_bytes(self._words[address + 2 * k], "big")
 
-    @property
-    def _held(self) -> int:
-        return self.fifo.level + sum(part.size for part in self._pending)
+    def _target(self, k: int) -> StreamedOutput:
+        """Return the output of a stream-out; raise RejectedRequest if it has none."""
+        target = self.outputs.get(self._number(stream.OUT_TARGET, k))
+        if target is None:
+            raise RejectedRequest(_FAILURE_EXCEPTION)
+        return target
 
-    def _number(self, address: int) -> int:
-        return int.from_bytes(self._words[address], "big")
+    def _room(self, k: int) -> int:
+        """Return the number of values that a stream-out's buffer still takes."""
+        if not self._number(stream.OUT_ENABLE, k):
+            return 0
+        return self._number(stream.OUT_ALLOCATE_BYTES, k) // BYTES_A_SAMPLE - self._target(k).held
 
     def _set_rate(self, data: bytes) -> None:
         """Keep the rate that the clock can make (description of STREAM_SCANRATE_HZ)."""
@@ -177,55 +252,54 @@ class LabJackStream:
         real_hz = 1e9 / (unit_ns * round(1e9 / rate_hz / unit_ns))
         self._words[stream.SCANRATE_HZ] = stream.f32(real_hz)
 
-    def _enable_output(self, data: bytes) -> None:
-        self._words[stream.OUT_ENABLE] = data
-        size = self._number(stream.OUT_ALLOCATE_BYTES)
+    def _enable_output(self, k: int, data: bytes) -> None:
+        self._words[stream.OUT_ENABLE + 2 * k] = data
+        size = self._number(stream.OUT_ALLOCATE_BYTES, k)
         allowed = 32 <= size <= self._streaming.buffer_bytes and not size & (size - 1)
-        if self._number(stream.OUT_ENABLE):
-            targeted = self._number(stream.OUT_TARGET) == self._target
-            _require(allowed and targeted, _FAILURE_EXCEPTION)
-        self.fifo.clear()
-        self._pending.clear()
+        if self._number(stream.OUT_ENABLE, k):
+            _require(allowed, _FAILURE_EXCEPTION)
+            self._target(k).clear()
 
-    def _take_values(self, data: bytes) -> None:
+    def _take_values(self, k: int, data: bytes) -> None:
         values = np.frombuffer(data, ">f4").astype(np.float64)
-        low, high = self._limits
-        slack = 1e-6 * (high - low)
-        good = (values >= low - slack) & (values <= high + slack)
-        _require(bool(good.all()), _VALUE_EXCEPTION)
-        fits = self._held + values.size <= self._capacity
-        _require(fits and self._number(stream.OUT_ENABLE) != 0, _FAILURE_EXCEPTION)
-        self._pending.append(values)
+        _require(values.size <= self._room(k), _FAILURE_EXCEPTION)
+        self._target(k).take(values)
 
-    def _use_values(self, data: bytes) -> None:
+    def _free(self, k: int, count: int) -> bytes:
+        return stream.u32(self._room(k))
+
+    def _use_values(self, k: int, data: bytes) -> None:
         _require(data == stream.u32(stream.USE_AT_ONCE), _VALUE_EXCEPTION)
-        for values in self._pending:
-            self.fifo.queue(self._wiring.command(values))
-        self._pending.clear()
+        self._target(k).use()
 
     def _enable(self, data: bytes) -> None:
         starts = data != stream.u32(0)
-        _require(starts != self.fifo.running, _FAILURE_EXCEPTION)
+        _require(starts != self.running, _FAILURE_EXCEPTION)
         if not starts:
-            self.fifo.stop()
+            self.stop(self._now_ns)
             return
         count = self._number(stream.NUM_ADDRESSES)
-        _require(2 <= count <= len(self._analog) + 1, _FAILURE_EXCEPTION)
-        scanned = [self._number(stream.SCANLIST_ADDRESS + 2 * k) for k in range(count)]
-        found = scanned[:1] + scanned[-1:] + [self._number(stream.AUTO_TARGET)]
-        wanted = [self._source, stream.STREAM_OUT0, stream.COMMAND_RESPONSE]
+        _require(2 <= count <= len(self._analog) + _STREAM_OUTS, _FAILURE_EXCEPTION)
+        listed = [self._number(stream.SCANLIST_ADDRESS, k) for k in range(count)]
+        self._scanned = [each for each in listed if each in self._analog]
+        # The inputs first: a scan reads them before it changes any output.
+        numbers = [each - stream.STREAM_OUT0 for each in listed[len(self._scanned) :]]
+        in_order = bool(self._scanned) and listed[: len(self._scanned)] == self._scanned
+        _require(in_order and {*numbers} <= {*range(_STREAM_OUTS)}, _FAILURE_EXCEPTION)
+        self._streamed = [self._target(k) for k in numbers]
+        apart = len({*self._streamed}) == len(numbers) > 0
+        shown = self._scanned[0] in {each.sensor for each in self.outputs.values()}
         (rate_hz,) = struct.unpack(">f", self._words[stream.SCANRATE_HZ])
-        self._inputs = count - 1
-        allowed = 0.0 < rate_hz <= self._streaming.rate_max_hz(self._inputs)
-        allowed &= self._analog.issuperset(scanned[:-1])
-        _require(allowed and found == wanted, _FAILURE_EXCEPTION)
+        allowed = 0.0 < rate_hz * count <= self._streaming.samples_per_s_max
+        allowed &= self._number(stream.AUTO_TARGET) == stream.COMMAND_RESPONSE
+        _require(apart and shown and allowed, _FAILURE_EXCEPTION)
         self.input.start(self._number(stream.BUFFER_SIZE_BYTES))
-        self.fifo.command = self._rig.command
-        self.fifo.set_rate(rate_hz)
-        self.fifo.start(self._now_ns)
+        for each in self.outputs.values():
+            each.start(rate_hz, self._now_ns)
+        self.running = True
 
     def _data(self, count: int) -> bytes:
-        _require(self.fifo.running, _FAILURE_EXCEPTION)
+        _require(self.running, _FAILURE_EXCEPTION)
         return self.input.fetch(count)
 
     def _read_flash(self, count: int) -> bytes:
@@ -244,11 +318,14 @@ def _plain(profile: ModbusProfile, streaming: LabJackStreaming) -> set[int]:
     settings = {
         stream.SCANRATE_HZ, stream.NUM_ADDRESSES, stream.SETTLING_US, stream.RESOLUTION_INDEX,
         stream.BUFFER_SIZE_BYTES, stream.AUTO_TARGET, stream.DATATYPE, stream.NUM_SCANS,
-        stream.OUT_TARGET, stream.OUT_ALLOCATE_BYTES, stream.OUT_LOOP_NUM_VALUES,
-        stream.OUT_ENABLE, stream.FLASH_READ_POINTER,
+        stream.FLASH_READ_POINTER,
     }  # fmt: skip
+    for_output = {
+        stream.OUT_TARGET, stream.OUT_ALLOCATE_BYTES, stream.OUT_LOOP_NUM_VALUES, stream.OUT_ENABLE,
+    }  # fmt: skip
+    outputs = {first + 2 * k for first in for_output for k in range(_STREAM_OUTS)}
     scanned = {stream.SCANLIST_ADDRESS + 2 * k for k in range(128)}
     steps = {
         profile.wire_address(step) for step in streaming.setup if isinstance(step, RegisterStep)
     }
-    return settings | scanned | steps
+    return settings | outputs | scanned | steps

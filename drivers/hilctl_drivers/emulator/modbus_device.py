@@ -92,21 +92,13 @@ def _hit(trigger: Target | None, target: Words) -> bool:
 class EmulatedModbus(EmulatedDevice):
     """The device: its registers, and the effects of writing them.
 
-    It powers up as the profile says, or at ``command``; otherwise with the rig at 0. Two
-    devices can share a rig: one drives it, the other shows its displacement.
+    It powers up as the profile says, or at ``command``; otherwise with its rigs at 0.
     """
 
     profile: ModbusProfile
 
-    def __init__(
-        self,
-        profile: ModbusProfile,
-        bench: Bench,
-        output: str | None,
-        sensor: str | None,
-        command: float | None = None,
-    ) -> None:
-        super().__init__(profile, bench, output, sensor)
+    def __init__(self, profile: ModbusProfile, bench: Bench, command: float | None = None) -> None:
+        super().__init__(profile, bench)
         self.memory = RegisterMap(profile)
         self._steps = self.memory.steps
         self._outputs, self._inputs = self.memory.outputs, self.memory.inputs
@@ -115,19 +107,18 @@ class EmulatedModbus(EmulatedDevice):
         if self._watchdog is not None:
             self._timer = self._watchdog
         self.overlay: LabJackStream | None = None  # registers of a stream, before all others
-        if streaming != "none" and output in streaming.outputs and sensor in streaming.inputs:
-            self.overlay = LabJackStream(
-                profile, streaming, output, sensor, bench, on_played=self._played
-            )
+        if streaming != "none":
+            self.overlay = LabJackStream(profile, streaming, bench, on_played=self._played)
         self._power_up(command)
 
     def _power_up(self, command: float | None) -> None:
         for name, words in self._outputs.items():
             value = self.profile.outputs[name].power_up
-            if name == self._output:
+            if name in self._driven:
+                driven = self._driven[name]
                 if value is None or command is not None:
-                    value = self.wiring.output(command or 0.0)
-                self._rig.put_out(self.wiring.command(value), 0)
+                    value = driven.wiring.output(command or 0.0)
+                driven.rig.put_out(driven.wiring.command(value), 0)
             if value is not None:
                 words.value = value
 
@@ -136,10 +127,9 @@ class EmulatedModbus(EmulatedDevice):
             self.overlay.tick(self._now_ns)
         super()._advance()
 
-    def _played(self, first: int, command: F64, now_ns: int) -> None:
-        assert self._output is not None
-        self._rig.put_out(float(command[-1]), now_ns)
-        self._outputs[self._output].value = self._log_played(first, command, now_ns)
+    def _played(self, name: str, first: int, command: F64, now_ns: int) -> None:
+        self._driven[name].rig.put_out(float(command[-1]), now_ns)
+        self._outputs[name].value = self._log_played(name, first, command, now_ns)
 
     def request(self, now_ns: int) -> None:
         """Note that a request has come; before it is executed."""
@@ -255,8 +245,8 @@ class EmulatedModbus(EmulatedDevice):
     def _measure(self) -> None:
         for name, source in self.profile.inputs.items():
             self._inputs[name].value = self._reading(name, source)
-        if self._sensor is not None:
-            validity = self.profile.inputs[self._sensor].validity
+        for name in self._shown:
+            validity = self.profile.inputs[name].validity
             if validity != "none":
                 bits = validity.valid ^ (validity.mask * self._is_invalid)
                 self._steps[id(validity)].set_bits(validity.mask, bits)

@@ -91,6 +91,19 @@ ReaderLine: TypeAlias = Literal["same", "own"]
 
 
 @dataclass(frozen=True)
+class RigOptions:
+    """Options of one rig and its wiring."""
+
+    output: str | None = None  # drives the rig; the profile's first if None
+    sensor: str | None = None  # shows the displacement; the first possible input if None
+    # A rated current or stage that it does not state is that of the limits, or of the wiring.
+    actuator: SimulatedOptions = field(default_factory=TerfenolOptions)
+    # Amplifier and sensor; spread over the channels' ranges if None.
+    wiring: tuple[Amplifier | None, Sensor] | None = None
+    limits: tuple[float, float] | None = None  # of an experiment's drive, A or V
+
+
+@dataclass(frozen=True)
 class EmulatorOptions:
     """Options of an emulator; initial command and unit of the reader are for Modbus only."""
 
@@ -101,16 +114,10 @@ class EmulatorOptions:
     port: int = 0  # TCP port to listen on; 0 for a free one
     log: Path | None = None  # file for a log of every write, one JSON object per line
     faults: tuple[WireFault, ...] = ()
-    output: str | None = None  # drives the rig; the profile's first if None
-    sensor: str | None = None  # shows the displacement; the first possible input if None
-    reader: str | None = None  # profile of the device with that input, if it is another one
+    rigs: tuple[RigOptions, ...] = (RigOptions(),)  # each with an output and an input of its own
+    reader: str | None = None  # profile of the device with the inputs, if it is another one
     # On the same line or connection, or on its own; if None, Modbus RTU devices share a line.
     reader_line: ReaderLine | None = None
     reader_unit_id: int | None = None  # if None its profile's, or the next on the same line
     reader_port: int = 0  # TCP port of its own; 0 for a free one
-    # A rated current or stage that it does not state is that of the limits, or of the wiring.
-    actuator: SimulatedOptions = field(default_factory=TerfenolOptions)
-    # Amplifier and sensor; spread over the channels' ranges if None.
-    wiring: tuple[Amplifier | None, Sensor] | None = None
-    limits: tuple[float, float] | None = None  # of an experiment's drive, A or V
     command: float | None = None  # initial command, as if it was the power-up value

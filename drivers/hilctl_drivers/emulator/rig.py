@@ -2,7 +2,7 @@
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeAlias
@@ -157,29 +157,39 @@ class WriteLog:
 
 
 @dataclass(frozen=True, slots=True)
-class Bench:
-    """A rig, its wiring, and the log of its outputs; devices may share it."""
+class WiredRig:
+    """A rig between an output and an input, of one device or of two."""
 
     rig: Rig
     wiring: SimulatedWiring
+
+    @property
+    def logged_as(self) -> str:
+        """Name of its command in the log."""
+        return COLUMNS["command"].field(self.wiring.command_unit).name
+
+
+@dataclass(frozen=True, slots=True)
+class Bench:
+    """The rigs at the terminals of one device, at least one, and the log of its outputs.
+
+    If it has both outputs and inputs, they are in the same order.
+    """
+
+    driven: Mapping[str, WiredRig]  # by output
+    shown: Mapping[str, WiredRig]  # by input
     log: WriteLog
 
 
 class EmulatedDevice(ABC):
-    """A device on a bench.
-
-    ``output`` drives the rig, and ``sensor`` shows its displacement; None if another device does.
-    """
+    """A device on a bench; another device may have the inputs of its rigs, or their outputs."""
 
     profile: BaseProfile
 
-    def __init__(
-        self, profile: BaseProfile, bench: Bench, output: str | None, sensor: str | None
-    ) -> None:
+    def __init__(self, profile: BaseProfile, bench: Bench) -> None:
         self.profile = profile
-        self.wiring, self._rig, self._log = bench.wiring, bench.rig, bench.log
-        self._output, self._sensor = output, sensor
-        self._logged = COLUMNS["command"].field(bench.wiring.command_unit).name
+        self._driven, self._shown, self._log = bench.driven, bench.shown, bench.log
+        self._wired = (*bench.driven.values(), *bench.shown.values())
         self._timer = WatchdogTimer()
         self._now_ns = 0
         self.invalid_until_ns = 0
@@ -212,31 +222,34 @@ class EmulatedDevice(ABC):
         """Apply a watchdog trip to the outputs."""
 
     def _advance(self) -> None:
-        self._rig.advance(self._now_ns)
+        for each in self._wired:
+            each.rig.advance(self._now_ns)
 
     def _reading(self, name: str, source: Range) -> float:
-        """Return the reading of an input: the displacement, or the output for all other inputs."""
-        if name == self._sensor:
-            return float(self.wiring.at_terminal(self._rig.displacement_um))
-        return float(self.wiring.monitor(np.asarray(self._rig.command), source))
+        """Return the reading of an input: a displacement, or the first output for all others."""
+        if name in self._shown:
+            shown = self._shown[name]
+            return float(shown.wiring.at_terminal(shown.rig.displacement_um))
+        first = self._wired[0]
+        return float(first.wiring.monitor(np.asarray(first.rig.command), source))
 
     def _set_terminal(self, name: str, value: float, event: str, now_ns: int) -> None:
-        """Log an output's new value, and drive the rig if it is wired to it."""
+        """Log an output's new value, and drive the rig if one is wired to it."""
         more: dict[str, float] = {}
-        if name == self._output:
-            self._rig.put_out(self.wiring.command(value), now_ns)
-            more[self._logged] = self._rig.command
+        if name in self._driven:
+            driven = self._driven[name]
+            driven.rig.put_out(driven.wiring.command(value), now_ns)
+            more[driven.logged_as] = driven.rig.command
         unit = self.profile.outputs[name].unit
         self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
 
-    def _log_played(self, first: int, command: F64, now_ns: int) -> float:
+    def _log_played(self, name: str, first: int, command: F64, now_ns: int) -> float:
         """Log a block that a FIFO has output; return its last value in the output's unit."""
-        assert self._output is not None
-        last = float(command[-1])
-        value, unit = self.wiring.output(last), self.profile.outputs[self._output].unit
+        last, driven = float(command[-1]), self._driven[name]
+        value, unit = driven.wiring.output(last), self.profile.outputs[name].unit
         self._log.event(
-            now_ns, "played", output=self._output, first=first, samples=command.size,
-            value=value, unit=unit, **{self._logged: last},
+            now_ns, "played", output=name, first=first, samples=command.size,
+            value=value, unit=unit, **{driven.logged_as: last},
         )  # fmt: skip
         return value
 

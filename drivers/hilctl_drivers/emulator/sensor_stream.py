@@ -13,10 +13,9 @@ class EmulatedStream(EmulatedDevice, EmulatedWire):
 
     profile: StreamProfile
 
-    def __init__(self, profile: StreamProfile, bench: Bench, sensor: str) -> None:
-        super().__init__(profile, bench, None, sensor)
+    def __init__(self, profile: StreamProfile, bench: Bench) -> None:
+        super().__init__(profile, bench)
         self.devices = (self,)
-        self._source = profile.inputs[sensor]
         self._inputs = profile.inputs.values()
         self._begin_ns: int | None = None
         self._sent = 0
@@ -24,7 +23,7 @@ class EmulatedStream(EmulatedDevice, EmulatedWire):
         """Time until which its samples are lost."""
 
     def block(self, now_ns: int) -> bytes:
-        """Return the block with the samples since the last one; all show the present reading."""
+        """Return the block with the samples since the last one; all show the present readings."""
         self.tick(now_ns)
         self._begin_ns = now_ns if self._begin_ns is None else self._begin_ns
         due = 1 + int((now_ns - self._begin_ns) * self.profile.max_rate_hz * 1e-9) - self._sent
@@ -50,14 +49,16 @@ class EmulatedStream(EmulatedDevice, EmulatedWire):
         return bytes(head) + frame * frames
 
     def _frame(self) -> bytes:
-        """Return a frame with the reading; the other values are 0."""
-        source, form, size = self._source, self._source.format, self.profile.header.frame_size
+        """Return a frame with the readings; the other values are 0."""
+        size = self.profile.header.frame_size
         ends = [each.at + each.format.size for each in self._inputs]
         frame = bytearray(max(ends) if isinstance(size, HeaderField) else size)
-        value = float(self.wiring.at_terminal(self._rig.displacement_um))
-        if self._is_invalid and source.valid is not None:
-            value = (source.valid[1] + 1) * source.scale + source.offset
-        frame[source.at : source.at + form.size] = form.encode(value)
+        for name, shown in self._shown.items():
+            source, form = self.profile.inputs[name], self.profile.inputs[name].format
+            value = float(shown.wiring.at_terminal(shown.rig.displacement_um))
+            if self._is_invalid and source.valid is not None:
+                value = (source.valid[1] + 1) * source.scale + source.offset
+            frame[source.at : source.at + form.size] = form.encode(value)
         return bytes(frame)
 
     def _trip(self, due_ns: int) -> None:

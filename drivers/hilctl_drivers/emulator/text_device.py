@@ -49,27 +49,25 @@ def _with_number(form: NumberReply, reply: str, number: float) -> str:
 
 
 class EmulatedText(SerialDevice):
-    """The device; ``sensor`` is the input that shows the displacement, None for none."""
+    """The device."""
 
     profile: AsciiProfile
 
-    def __init__(
-        self, profile: AsciiProfile, bench: Bench, output: str | None, sensor: str | None
-    ) -> None:
-        super().__init__(profile, bench, output, sensor)
+    def __init__(self, profile: AsciiProfile, bench: Bench) -> None:
+        super().__init__(profile, bench)
         self._address = profile.unit
         # The power-up value is 0 at the terminal, not at the actuator.
         self._values = {
             name: min(max(0.0, each.min), each.max) for name, each in profile.outputs.items()
         }
         self._commands = dict(self._values)
-        rest = self.wiring.output(0.0)
+        rest = {name: each.wiring.output(0.0) for name, each in self._driven.items()}
         self._safe = {
-            name: min(max(rest if name == output else 0.0, each.min), each.max)
+            name: min(max(rest.get(name, 0.0), each.min), each.max)
             for name, each in profile.outputs.items()
         }
-        if output is not None:
-            self._rig.put_out(self.wiring.command(self._values[output]), 0)
+        for name, driven in self._driven.items():
+            driven.rig.put_out(driven.wiring.command(self._values[name]), 0)
         self._errors: list[str] = []
 
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
@@ -172,7 +170,7 @@ class EmulatedText(SerialDevice):
 
     def _said(self, name: str, source: AsciiInput, form: MeasuredReply, reply: str = "") -> str:
         """Return the reply of a form with a reading, or the reply that marks it as invalid."""
-        if form.invalid != "none" and name == self._sensor and self._is_invalid:
+        if form.invalid != "none" and name in self._shown and self._is_invalid:
             return form.invalid.example
         value = min(max(self._reading(name, source), source.min), source.max)
         return _with_number(form, reply, source.number(value))

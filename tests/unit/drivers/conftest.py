@@ -9,7 +9,7 @@ from hilctl_drivers.dac import SerialDac, SerialOptions
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.simulated.devices import TerfenolOptions
-from tests.fakes import ShiftedClock, emulated, logged
+from tests.fakes import ShiftedClock, emulated, logged, one_rig
 
 TIMEOUT_S = 1.0
 """A busy machine answers within it."""
@@ -73,7 +73,7 @@ def serial_bench(tmp_path):
             wanted = EmulatorOptions(
                 profile,
                 log=log,
-                actuator=TerfenolOptions(noise=noise),
+                rigs=one_rig(actuator=TerfenolOptions(noise=noise)),
                 faults=tuple(map(parse_fault, faults)),
                 link=link,
                 reader=reader,

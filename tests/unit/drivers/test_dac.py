@@ -356,7 +356,7 @@ def test_looking_changes_nothing(rig, kind):
     assert tripped == bool(watched)
     held = 3.0 if kind == "scpi" else 0.0  # tripped
     assert output == pytest.approx(held, abs=2e-3)
-    assert displacement_um == pytest.approx(bench.emulator.device._rig.displacement_um, abs=0.5)
+    assert displacement_um == pytest.approx(bench.emulator.rigs[0].rig.displacement_um, abs=0.5)
     since = bench.events()[len(before) :]
     assert {event["event"] for event in since} <= {"watchdog"}
     if kind != "scpi":

@@ -17,7 +17,7 @@ from hilctl.run.probe import judge, probe
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import shipped_profiles
 from hilctl_drivers.simulated.devices import TerfenolOptions
-from tests.fakes import ManualClock, emulated, held_devices, logged
+from tests.fakes import ManualClock, emulated, held_devices, logged, one_rig
 
 CONFIGS = Path(__file__).parents[3] / "configs"
 INFO = DeviceInfo(
@@ -97,7 +97,7 @@ def rig(tmp_path):
                 str(path),
                 log=tmp_path / "writes.jsonl",
                 reader=reader,
-                actuator=TerfenolOptions(noise=False),
+                rigs=one_rig(actuator=TerfenolOptions(noise=False)),
             )
             emulator = stack.enter_context(emulated(wanted, clock))
             return ProbedRig(emulator, clock, tmp_path, **device)
@@ -156,7 +156,7 @@ def test_a_wrong_query_of_the_output_is_found(rig, query):
 def test_a_wrong_word_order_is_found(rig):
     probed = rig("labjack_t7")
     # 1.6 V, 3fcccccd: with its words the other way round -1.08e8 V.
-    probed.emulator.device._rig.displacement_um = 20.0
+    probed.emulator.rigs[0].rig.displacement_um = 20.0
     assert probe(probed.experiment, []).displacement_um == pytest.approx(20.0)
     profile = Path(probed.device["profile"])
     text = profile.read_text(encoding="utf-8")

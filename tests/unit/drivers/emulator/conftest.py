@@ -1,16 +1,17 @@
 """Emulators that all tests here share."""
 
 from contextlib import ExitStack
+from dataclasses import fields
 
 import pytest
 
 from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
-from hilctl_drivers.emulator.options import EmulatorOptions
-from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WriteLog
+from hilctl_drivers.emulator.options import EmulatorOptions, RigOptions
+from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WiredRig, WriteLog
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
-from tests.fakes import emulated, logged
+from tests.fakes import emulated, logged, one_rig
 
 MS = 1_000_000
 START_NS = 10_000_000_000
@@ -21,8 +22,9 @@ def emulated_modbus(name, output, sensor, current_a=None):
     profile = load_profile(name)
     actuator = SimulatedTerfenol(TerfenolOptions())
     wiring = SimulatedWiring.spread(profile.outputs[output], profile.inputs[sensor], actuator)
-    bench = Bench(Rig(0, actuator), wiring, WriteLog(None, 0))
-    return EmulatedModbus(profile, bench, output, sensor, current_a)
+    wired = WiredRig(Rig(0, actuator), wiring)
+    bench = Bench({output: wired}, {sensor: wired}, WriteLog(None, 0))
+    return EmulatedModbus(profile, bench, current_a)
 
 
 class Emulated:
@@ -31,9 +33,10 @@ class Emulated:
     def __init__(self, profile, tmp_path, **wanted):
         self.log = tmp_path / "writes.jsonl"
         self.now_ns = START_NS
-        made = EmulatorOptions(
-            str(profile), log=self.log, **{"actuator": TerfenolOptions(noise=False), **wanted}
-        )
+        names = {each.name for each in fields(RigOptions)}
+        of_rig = {name: wanted.pop(name) for name in names & wanted.keys()}
+        rigs = one_rig(**{"actuator": TerfenolOptions(noise=False), **of_rig})
+        made = EmulatorOptions(str(profile), log=self.log, **{"rigs": rigs, **wanted})
         self.emulator = build(made, lambda: self.now_ns)
         self.device = self.emulator.device
 

@@ -12,7 +12,7 @@ from hilctl.base.errors import InputError
 from hilctl.cli.commands import app
 from hilctl_drivers.emulator.emulate_command import serve, wired_experiment
 from hilctl_drivers.emulator.factory import build
-from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
+from hilctl_drivers.emulator.options import EmulatorOptions, RigOptions, parse_fault
 from hilctl_drivers.emulator.server import EmulatorServer
 
 CONFIGS = Path(__file__).parents[4] / "configs"
@@ -100,7 +100,7 @@ def test_options_become_the_emulator(words, tmp_path, monkeypatch):
             log=log,
             faults=(parse_fault("cut@2"), parse_fault("delay:0.3@1s")),
             reader="agilent_34970a",
-            sensor="AI102",
+            rigs=(RigOptions(sensor="AI102"),),
         )
     ]
 
@@ -110,8 +110,8 @@ def test_it_has_the_amplifier_of_the_experiment(tmp_path):
     path = tmp_path / "rig.yaml"
     path.write_text(limit + (CONFIGS / "modbus_labjack_t7.yaml").read_text())
     options = wired_experiment(path).options
-    assert options.actuator.amplifier.voltage_max_v == 36.0
-    assert options.limits == (-7.07, 7.07)
+    assert options.rigs[0].actuator.amplifier.voltage_max_v == 36.0
+    assert options.rigs[0].limits == (-7.07, 7.07)
 
 
 T8_PIEZO = """\

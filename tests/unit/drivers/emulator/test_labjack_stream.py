@@ -27,8 +27,8 @@ def f32(*values):
 class Device:
     """An emulated T7 and short words to ask it with."""
 
-    def __init__(self):
-        self.emulated = InProcess.of("labjack_t7")
+    def __init__(self, rigs=1):
+        self.emulated = InProcess.of("labjack_t7", rigs=rigs)
         self.emulated.link.open()
         profile, link = load_profile("labjack_t7"), self.emulated.link
         self.feedback = ModbusSession(profile, link, 1, framing="tcp").feedback
@@ -44,8 +44,10 @@ class Device:
             self.write(address, u32(value))
         self.write(4002, f32(rate_hz))
 
-    def play(self, *volts):
-        self.feedback(write_frame(4400, f32(*volts)), write_frame(4070, u32(1)))
+    def play(self, *volts, number=0):
+        self.feedback(
+            write_frame(4400 + 2 * number, f32(*volts)), write_frame(4070 + 2 * number, u32(1))
+        )
 
     def data(self, samples):
         """Return samples, backlog, status, what belongs to it, and the readings."""
@@ -107,6 +109,56 @@ def test_a_full_buffer_drops_scans_until_it_is_emptied(device):
     assert device.data(60) == (1, 0, 2941, 36, [0xFFFF])
     device.wait(0.0055)
     assert device.data(60)[2] == 0
+
+
+SECOND = {4042: 1002, 4052: 256, 4062: 1, 4092: 1}  # stream-out 1: DAC1
+
+
+class TestTwoOutputs:
+    """DAC0 and DAC1 in one scan list with AIN0 and AIN1; stream-outs are numbered from 0."""
+
+    @pytest.fixture
+    def device(self):
+        return Device(rigs=2)
+
+    def commands(self, device):
+        return [each.rig.command for each in device.emulated.rigs]
+
+    def test_each_moves_its_own_rig(self, device):
+        device.set_up(settings=SECOND | {4004: 4, 4102: 2, 4104: 4800, 4106: 4801})
+        device.play(2.5, 3.0, 3.5)
+        device.play(2.5, 2.0, number=1)
+        assert (device.read(4080), device.read(4082)) == (125, 126)
+        device.write(4990, u32(1))
+        device.wait(0.0101)
+        assert self.commands(device) == pytest.approx([0.0, 0.0])  # until the next message
+        assert (device.read(4080), device.read(4082)) == (128, 128)
+        assert self.commands(device) == pytest.approx([4.0, -2.0])
+        count, _, status, _, readings = device.data(20)
+        x, y = readings[::2], readings[1::2]
+        assert (count, status) == (20, 0)
+        assert x[-1] > x[0] == y[0] > y[-1]
+
+    def test_one_of_them_streams_alone(self, device):
+        """The other one keeps its value, also one written meanwhile."""
+        device.set_up(settings={4040: 1002, 4100: 2})
+        device.play(3.0)
+        device.write(4990, u32(1))
+        device.write(1000, f32(3.5))
+        device.wait(0.01)
+        device.read(4080)
+        assert self.commands(device) == pytest.approx([4.0, 2.0])
+
+    @pytest.mark.parametrize("settings", [
+        {4004: 4, 4102: 2, 4104: 4801, 4106: 4801},  # the same one twice
+        {4004: 4, 4102: 4800, 4104: 2, 4106: 4801},  # an input behind an output
+        {4004: 4, 4102: 2, 4104: 4800, 4106: 4802},  # a stream-out without a target
+    ])  # fmt: skip
+    def test_a_scan_list_that_it_can_not_scan_is_refused(self, device, settings):
+        device.set_up(settings=SECOND | settings)
+        with pytest.raises(RefusedError) as refused:
+            device.write(4990, u32(1))
+        assert refused.value.code == 4
 
 
 @pytest.mark.parametrize(("what", "code"), [

@@ -20,7 +20,7 @@ def test_blocks_hold_the_samples_since_the_last_one(emulate):
     found.feed(sensor.block(START_NS + 4 * MS))
     assert (found.values, found.lost) == (11, 4)
     shown_um = found.value - 100.0
-    assert shown_um == pytest.approx(sensor._rig.displacement_um, abs=1e-4)
+    assert shown_um == pytest.approx(made.emulator.rigs[0].rig.displacement_um, abs=1e-4)
     sensor.mark_invalid(START_NS + 15 * MS)
     found.feed(sensor.block(START_NS + 14 * MS))
     assert math.isnan(found.value)

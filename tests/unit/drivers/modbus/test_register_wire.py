@@ -11,7 +11,7 @@ from pydantic import ValidationError
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.dac import ModbusDac, ModbusOptions
 from hilctl_drivers.emulator.options import parse_fault
-from tests.fakes import T7_OPTIONS, made_safe
+from tests.fakes import T7_OPTIONS, made_safe, one_rig
 from tests.unit.drivers.modbus.conftest import exchange
 
 T7 = {**T7_OPTIONS, "host": "h"}
@@ -153,7 +153,7 @@ class TestExchange:
 
     def test_output_that_can_not_be_read_is_not_tried(self, serve):
         """A TDAC cannot be read back, so trying function 76 on it would move it."""
-        served = serve("labjack_t7", output="TDAC0")
+        served = serve("labjack_t7", rigs=one_rig(output="TDAC0"))
         device = served.running(333.0)
         assert device.info.max_rate_hz == pytest.approx(1e3 / 3)  # 1 ms each and 1 ms to settle
         assert device.transactions == 2
