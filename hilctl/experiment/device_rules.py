@@ -6,9 +6,9 @@ from collections.abc import Iterable, Iterator, Mapping
 from datetime import date
 from itertools import combinations
 
+from hilctl.base.axes import names_text
 from hilctl.base.device import AuxChannel, Device, DeviceInfo
 from hilctl.base.errors import ConfigProblem, DeviceError, broken
-from hilctl.experiment.axes import names_text
 from hilctl.experiment.rig import RunRig
 
 _YEAR_DAYS = 366

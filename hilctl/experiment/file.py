@@ -4,6 +4,7 @@ import json
 import re
 from typing import Annotated, Any, Literal
 
+from hilctl.base.axes import AXIS_NAME, MAX_AXES, RUN_KEYS
 from hilctl.base.device import DeviceInfo, VoltageLimit
 from hilctl.base.strict import (
     AfterValidator,
@@ -29,12 +30,6 @@ from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.rt_setup import Realtime
 from hilctl.waveforms.spec import AnyWaveform
 
-AXIS_NAME = "[a-z][a-z0-9_]*"
-"""Pattern of the names of axes."""
-MAX_AXES = 8
-RUN_KEYS = {"name", "description", "labels", "sample_rate_hz", "block", "trigger", "timing",
-            "recording", "realtime"}  # fmt: skip
-"""Keys of an experiment that are the same for all axes."""
 _NAME = "[A-Za-z0-9][A-Za-z0-9_.-]{0,79}"
 
 

@@ -11,19 +11,20 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from hilctl.base.device import Device
-from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
-from hilctl.base.files import TextFiles, is_file
-from hilctl.base.formatting import shown_briefly
-from hilctl.base.yaml import Document, dump, load_document, loc_of
-from hilctl.experiment.axes import (
+from hilctl.base.axes import (
+    AXIS_NAME,
     axis_documents,
     one_axis_document,
     problems_of_axes,
     with_settings,
 )
+from hilctl.base.device import Device
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
+from hilctl.base.files import TextFiles, is_file
+from hilctl.base.formatting import shown_briefly
+from hilctl.base.yaml import Document, dump, load_document, loc_of
 from hilctl.experiment.devices import made_device
-from hilctl.experiment.file import AXIS_NAME, Experiment
+from hilctl.experiment.file import Experiment
 from hilctl.experiment.rig import RunRig
 from hilctl.experiment.sections.conditioning import make_conditioning
 from hilctl.experiment.sections.correction import Correction, load_correction

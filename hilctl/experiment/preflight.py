@@ -11,10 +11,10 @@ from dataclasses import dataclass, replace
 
 import numpy as np
 
+from hilctl.base.axes import problems_of_axes
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
-from hilctl.experiment.axes import problems_of_axes
 from hilctl.experiment.device_rules import (
     calibration_warnings,
     channel_problems,

@@ -23,11 +23,11 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
+from hilctl.base.axes import names_text
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import MARK, Event
 from hilctl.base.private_dirs import private_folder
 from hilctl.base.strict import HALF_CHARACTER, StrictModel, first_problem, without_halves
-from hilctl.experiment.axes import names_text
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
 from hilctl.loop.compensator import Compensator
 from hilctl.run.control.client import (

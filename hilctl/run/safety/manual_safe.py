@@ -8,11 +8,11 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
+from hilctl.base.axes import one_axis_document, with_settings
 from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import load_document
-from hilctl.experiment.axes import one_axis_document, with_settings
 from hilctl.experiment.devices import made_device
 from hilctl.experiment.sections.safe import Safe
 from hilctl.loop.safe_output import (

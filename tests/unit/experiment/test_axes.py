@@ -5,9 +5,9 @@ from pathlib import Path
 
 import pytest
 
+from hilctl.base.axes import axis_documents, with_settings
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.axes import axis_documents, with_settings
 from hilctl.experiment.device_rules import clock_problems, output_problems
 from hilctl.experiment.load import input_files, inputs_of, load_axes, load_experiment
 from hilctl.experiment.preflight import check_axes

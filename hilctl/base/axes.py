@@ -7,7 +7,13 @@ from dataclasses import replace
 from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.formatting import did_you_mean
 from hilctl.base.yaml import Document, Loc, dotted, loc_of
-from hilctl.experiment.file import AXIS_NAME, MAX_AXES, RUN_KEYS
+
+AXIS_NAME = "[a-z][a-z0-9_]*"
+"""Pattern of the names of axes."""
+MAX_AXES = 8
+RUN_KEYS = {"name", "description", "labels", "sample_rate_hz", "block", "trigger", "timing",
+            "recording", "realtime"}  # fmt: skip
+"""Keys of an experiment that are the same for all axes."""
 
 
 def names_text(names: Sequence[str]) -> str:
