@@ -93,7 +93,7 @@ _HELP = {
             "devices": "List devices, shipped profiles and serial ports (opens none).",
         },
         "hilctl_drivers.emulator.emulate_command": {
-            "emulate": "Emulate a device with the simulated rig, until Ctrl-C.",
+            "emulate": "Emulate a device with simulated rigs, until Ctrl-C.",
         },
     },
 }

@@ -1,9 +1,9 @@
-"""The command ``hilctl emulate``: emulate a profile, or the device of an experiment."""
+"""The command ``hilctl emulate``: emulate a profile, or the devices of an experiment."""
 
 import gc
 import shlex
 import signal
-from collections.abc import Callable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from pathlib import Path
@@ -12,8 +12,9 @@ from typing import Annotated, Any, cast
 
 import typer
 
+from hilctl.base.axes import axis_documents, names_text, problems_of_axes, with_settings
 from hilctl.base.device import limited_range
-from hilctl.base.errors import ConfigError, InputError
+from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import finite_json
 from hilctl.base.types import CommandUnit
@@ -40,24 +41,39 @@ _HERE = ("127.0.0.1", "::1", "localhost")
 
 
 @dataclass(frozen=True, slots=True)
+class WiredAxis:
+    """An axis of an experiment, and where it is emulated."""
+
+    name: str  # empty if it is the only one
+    section: Mapping[str, Any]  # its device section, as in the file
+    device: int
+    rig: int  # of those of the device
+
+
+@dataclass(frozen=True, slots=True)
 class WiredExperiment:
-    """An experiment whose device is to be emulated."""
+    """An experiment whose devices are to be emulated."""
 
     path: Path
-    section: Mapping[str, Any]  # its device section, as in the file
-    options: EmulatorOptions
+    settings: tuple[str, ...]
+    axes: tuple[WiredAxis, ...]
+    options: tuple[EmulatorOptions, ...]  # one per device
 
-    def words(self, emulator: Emulator) -> list[str]:
-        """Return the arguments of ``hilctl`` that run it on an emulator, at any address."""
-        places: dict[str, Any] = {
-            key: emulator.options[key]
-            for key in ("host", "tcp_port", "serial_port", "reader")
-            if key in emulator.options
-        }
-        own, profile = self.section.get("unit_id"), emulator.device.profile
-        if own is not None and isinstance(profile, ModbusProfile) and own != profile.unit_id:
-            places["unit_id"] = profile.unit_id
-        settings = [f"device.{key}={value}" for key, value in _differing(places, self.section)]
+    def words(self, emulators: Sequence[Emulator]) -> list[str]:
+        """Return the arguments of ``hilctl`` that run it on emulators, at any addresses."""
+        settings = [*self.settings]
+        for axis in self.axes:
+            emulator = emulators[axis.device]
+            places: dict[str, Any] = {
+                key: value
+                for key, value in emulator.sections[axis.rig].items()
+                if key in {"host", "tcp_port", "serial_port", "reader"}
+            }
+            own, profile = axis.section.get("unit_id"), emulator.device.profile
+            if own is not None and isinstance(profile, ModbusProfile) and own != profile.unit_id:
+                places["unit_id"] = profile.unit_id
+            above = f"axes.{axis.name}." if axis.name else ""
+            settings += [f"{above}device.{k}={v}" for k, v in _differing(places, axis.section)]
         return ["run", str(self.path), *(word for each in settings for word in ("--set", each))]
 
 
@@ -66,51 +82,131 @@ def is_experiment(name: str) -> bool:
     path = Path(name)
     if path.suffix not in {".yaml", ".yml"} or not path.is_file():
         return False
-    return "device" in load_document(path).data
+    return not {"device", "axes"}.isdisjoint(load_document(path).data)
 
 
 def wired_experiment(
-    path: Path, port: int = 0, host: str | None = None, actuator: Sequence[str] = ()
+    path: Path,
+    settings: Sequence[str] = (),
+    port: int = 0,
+    host: str | None = None,
+    actuator: Sequence[str] = (),
 ) -> WiredExperiment:
-    """Return the device of an experiment to emulate; raise InputError if it has no profile."""
+    """Return the devices of an experiment to emulate; raise InputError if one has no profile."""
     # Port 0 stands for that of the experiment, or for a free one if users may not listen there.
-    document, files = load_document(path), TextFiles()
+    parts = axis_documents(with_settings(load_document(path), settings))
+    simulated = _by_axis(_actuator_document(actuator), [*parts])
+    files, devices, axes = TextFiles(), dict[Any, EmulatorOptions](), list[WiredAxis]()
+    problems: dict[str, Sequence[ConfigProblem]] = {}
+    for number, (name, document) in enumerate(parts.items()):
+        problems[name] = ()
+        try:
+            options = _device_options(document, path.parent, files)
+            rig = _rig_options(document, options, simulated[name], number)
+        except ConfigError as error:
+            problems[name] = error.problems
+            continue
+        place = _place(options)
+        made = devices.get(place) or _emulator_options(options, path.parent, host, port)
+        devices[place] = replace(made, rigs=(*made.rigs, rig))
+        index = [*devices].index(place)
+        axes.append(WiredAxis(name, document.data["device"], index, len(made.rigs)))
+        port = 0  # of the first device
+    if any(problems.values()):
+        raise ConfigError(problems_of_axes(problems))
+    return WiredExperiment(path, tuple(settings), tuple(axes), tuple(_apart(devices.values())))
+
+
+def _apart(devices: Iterable[EmulatorOptions]) -> Iterator[EmulatorOptions]:
+    """Yield the options of devices on ports of their own: free ones instead of one used twice."""
+    used = {0}
+    for each in devices:
+        ports = []
+        for wanted in (each.port, each.reader_port):
+            ports.append(0 if wanted in used else wanted)
+            used.add(wanted)
+        yield replace(each, port=ports[0], reader_port=ports[1])
+
+
+def _device_options(document: Document, folder: Path, files: TextFiles) -> DacOptions:
     section = document.data.get("device")
     name = section.get("profile") if isinstance(section, dict) else None
     if not isinstance(section, dict) or not isinstance(name, str):
         rule = "must name a profile: a device without one has no connection to emulate"
         raise ConfigError([document.problem("device.profile", rule)])
     # The options of a device of any protocol: those of serial_dac include all.
-    context = {"folder": path.parent, "files": files}
-    options: DacOptions = document.validate(
-        SerialOptions, at=("device",), without=("kind",), context=context
+    context = {"folder": folder, "files": files}
+    return document.validate(SerialOptions, at=("device",), without=("kind",), context=context)
+
+
+def _place(options: DacOptions) -> tuple[Any, ...]:
+    """Return a key that is equal for axes on the same device, with the same reader."""
+    addresses = (options, options.reader)
+    return tuple(
+        each and (each.profile.name, each.host, each.tcp_port, each.serial_port, each.unit_id)
+        for each in addresses
     )
+
+
+def _rig_options(
+    document: Document, options: DacOptions, simulated: Document, number: int
+) -> RigOptions:
     unit = "A" if options.amplifier is None else options.amplifier.command_unit
+    actuator = _actuator(unit, simulated, document.data.get("amplifier"))
+    return RigOptions(
+        output=options.output,
+        sensor=options.input,
+        # Sensors have noise of their own.
+        actuator=actuator.model_copy(update={"seed": actuator.seed + number}),
+        wiring=(options.amplifier, options.sensor),
+        limits=limited_range(document.data.get("limits")),
+    )
+
+
+def _emulator_options(
+    options: DacOptions, folder: Path, host: str | None, port: int
+) -> EmulatorOptions:
+    """Return the options of a device's emulator, without rigs."""
     of_reader: dict[str, Any] = {}
     if (reader := options.reader) is not None:
         of_reader = {
-            "reader": _found(reader.profile, path.parent),
+            "reader": _found(reader.profile, folder),
             "reader_link": _link(reader),
             "reader_line": "own" if reader.host or reader.serial_port else "same",
             "reader_unit_id": reader.unit_id,
             "reader_port": _port(reader),
         }
-    rig = RigOptions(
-        output=options.output,
-        sensor=options.input,
-        actuator=_actuator(unit, actuator, document.data.get("amplifier")),
-        wiring=(options.amplifier, options.sensor),
-        limits=limited_range(document.data.get("limits")),
-    )
-    made = EmulatorOptions(
-        profile=_found(options.profile, path.parent),
+    return EmulatorOptions(
+        profile=_found(options.profile, folder),
         link=_link(options),
         host=host or EmulatorOptions.host,
         port=port or _port(options),
-        rigs=(rig,),
+        rigs=(),
         **of_reader,
     )
-    return WiredExperiment(path, section, made)
+
+
+def _actuator_document(settings: Sequence[str]) -> Document:
+    """Return the options of the actuator that a user sets."""
+    document = Document("--actuator", "{}")
+    for each in settings:
+        document.set(each, "--actuator")
+    return document
+
+
+def _by_axis(document: Document, axes: Sequence[str]) -> dict[str, Document]:
+    """Return the options of the actuator of each axis: its own over those of all."""
+    own = document.data.get("axes")
+    if own is None or axes == [""]:
+        return dict.fromkeys(axes, document)
+    if not isinstance(own, dict) or not all(
+        name in axes and isinstance(each, dict) for name, each in own.items()
+    ):
+        rule = f"must hold options of {names_text(axes)}"
+        raise ConfigError([document.problem("axes", rule)])
+    common = document.copied()
+    common.remove("axes")
+    return {name: document.part(("axes", name), name) if name in own else common for name in axes}
 
 
 def _found(named: NamedProfile, folder: Path) -> str:
@@ -125,13 +221,8 @@ def _port(options: AddressOptions) -> int:
     return given if options.host in _HERE and given >= _UNPRIVILEGED else 0
 
 
-def _actuator(
-    unit: CommandUnit, settings: Sequence[str], amplifier: Any = None
-) -> SimulatedOptions:
+def _actuator(unit: CommandUnit, document: Document, amplifier: Any = None) -> SimulatedOptions:
     """Return the options of the actuator with a unit; ``amplifier`` is the experiment's section."""
-    document = Document("--actuator", "{}")
-    for each in settings:
-        document.set(each, "--actuator")
     of_device = [
         document.problem(key, "acts on simulated devices only")
         for key in ("fault", "output_at_open")
@@ -181,6 +272,14 @@ def emulate(
     port: Annotated[
         int, typer.Option(min=0, max=65535, help="TCP port; 0 for any free port.")
     ] = EmulatorOptions.port,
+    settings: Annotated[
+        list[str] | None,
+        typer.Option(
+            "--set",
+            metavar="KEY=VALUE",
+            help="Override a dotted key of the experiment; may be repeated.",
+        ),
+    ] = None,
     log: Annotated[Path | None, typer.Option(help="Log file for every write.")] = None,
     fault: Annotated[
         list[str] | None,
@@ -212,7 +311,8 @@ def emulate(
         list[str] | None,
         typer.Option(
             metavar="KEY=VALUE",
-            help="Option of the simulated actuator, such as load_kg=2; may be repeated.",
+            help="Option of the simulated actuator, such as load_kg=2, or axes.x.load_kg=2 for one"
+            " axis; may be repeated.",
         ),
     ] = None,
     command: Annotated[
@@ -227,7 +327,7 @@ def emulate(
         bool, typer.Option("--json", help="Print one line of JSON when ready.")
     ] = False,
 ) -> None:
-    """Emulate a device with the simulated rig, until Ctrl-C."""
+    """Emulate a device with simulated rigs, until Ctrl-C."""
     wired = None
     own: dict[str, Any] = {
         "link": link, "reader": reader, "reader_line": reader_line,
@@ -239,68 +339,84 @@ def emulate(
         if given:
             names = ", ".join(f"--{key.replace('_', '-')}" for key in given)
             raise InputError(f"{names}: specified by {profile} already")
-        wired = wired_experiment(Path(profile), port, host, actuator or ())
-        options = wired.options
+        wired = wired_experiment(Path(profile), settings or (), port, host, actuator or ())
+        devices = wired.options
+    elif settings:
+        raise InputError("--set: is for keys of an experiment")
     else:
         if reader is None and sensor is not None and ":" in sensor:
             own["reader"], _, sensor = sensor.rpartition(":")
-        rig = RigOptions(output, sensor, _actuator(unit or "A", actuator or ()))
-        options = EmulatorOptions(profile, host=host, port=port, rigs=(rig,), **own)
+        simulated = _actuator(unit or "A", _actuator_document(actuator or ()))
+        rigs = (RigOptions(output, sensor, simulated),)
+        devices = (EmulatorOptions(profile, host=host, port=port, rigs=rigs, **own),)
     faults = tuple(parse_fault(text) for text in fault or ())
-    reader_port = reader_port or options.reader_port
-    options = replace(options, log=log, faults=faults, command=command, reader_port=reader_port)
+    first = replace(devices[0], reader_port=reader_port or devices[0].reader_port)
+    options = [
+        replace(each, log=log, faults=faults, command=command) for each in (first, *devices[1:])
+    ]
     serve(options, partial(_say, as_json=as_json, wired=wired))
 
 
-def _say(emulator: Emulator, *, as_json: bool, wired: WiredExperiment | None) -> None:
+def _say(emulators: Sequence[Emulator], *, as_json: bool, wired: WiredExperiment | None) -> None:
+    axes = (WiredAxis("", {}, 0, 0),) if wired is None else wired.axes
     if as_json:
-        typer.echo(finite_json(_report(emulator, wired)))
+        places = [place._asdict() for each in emulators for place in each.places]
+        wirings = {each.name: _wiring(emulators[each.device], each.rig) for each in axes}
+        report = {"devices": places, "wiring": wirings.get("", wirings)}
+        if wired is not None:
+            report["arguments"] = wired.words(emulators)
+        typer.echo(finite_json(report))
         return
-    for profile, address, unit_id in emulator.places:
-        unit = f", unit {unit_id}" if unit_id is not None else ""
-        typer.echo(f"{profile} answers at {address}{unit}")
-    for section, wired_rig in zip(emulator.sections, emulator.rigs, strict=True):
-        wiring, info = wired_rig.wiring, wired_rig.rig.actuator.info
-        gain, offset, um_per_unit, offset_um = wiring.factors
-        unit = wiring.command_unit
-        drive = {"A": "current", "V": "voltage"}[unit]
-        typer.echo(f"{section['output']}: {drive} = {gain:g} {unit} x output {offset:+g} {unit}")
-        shown = f"{um_per_unit:g} µm x input {offset_um:+g} µm"
-        typer.echo(f"{section['input']}: displacement = {shown}")
-        limits = f"{info.command_min:g} to {info.command_max:g} {unit}"
-        typer.echo(f"{info.name}: {limits}, {info.sensor_min_um:g} to {info.sensor_max_um:g} µm")
+    for number, emulator in enumerate(emulators):
+        names = ", ".join(each.name for each in axes if each.name and each.device == number)
+        for profile, address, unit_id in emulator.places:
+            unit = f", unit {unit_id}" if unit_id is not None else ""
+            typer.echo(f"{profile} answers at {address}{unit}{names and f' ({names})'}")
+    for axis in axes:
+        _say_wiring(axis.name and f"{axis.name}, ", emulators[axis.device], axis.rig)
     if wired is not None:
-        typer.echo(f"hilctl {shlex.join(wired.words(emulator))}")
+        typer.echo(f"hilctl {shlex.join(wired.words(emulators))}")
 
 
-def _report(emulator: Emulator, wired: WiredExperiment | None) -> dict[str, Any]:
-    wiring = emulator.rigs[0].wiring
+def _say_wiring(above: str, emulator: Emulator, rig: int) -> None:
+    wiring, info = emulator.rigs[rig].wiring, emulator.rigs[rig].rig.actuator.info
+    section = emulator.sections[rig]
+    gain, offset, um_per_unit, offset_um = wiring.factors
+    unit = wiring.command_unit
+    drive = {"A": "current", "V": "voltage"}[unit]
+    typer.echo(f"{above}{section['output']}: {drive} = {gain:g} {unit} x output {offset:+g} {unit}")
+    shown = f"{um_per_unit:g} µm x input {offset_um:+g} µm"
+    typer.echo(f"{above}{section['input']}: displacement = {shown}")
+    limits = f"{info.command_min:g} to {info.command_max:g} {unit}"
+    reach = f"{info.sensor_min_um:g} to {info.sensor_max_um:g} µm"
+    typer.echo(f"{above}{info.name}: {limits}, {reach}")
+
+
+def _wiring(emulator: Emulator, rig: int) -> dict[str, Any]:
+    wiring, section = emulator.rigs[rig].wiring, emulator.sections[rig]
     suffix = wiring.command_unit.lower()
     names = f"gain_{suffix}", f"offset_{suffix}", "sensor_um", "offset_um"
-    terminals = {key: emulator.options[key] for key in ("output", "input")}
-    report = {
-        "devices": [each._asdict() for each in emulator.places],
-        "wiring": terminals | dict(zip(names, wiring.factors, strict=True)),
-    }
-    if wired is not None:
-        report["arguments"] = wired.words(emulator)
-    return report
+    terminals = {key: section[key] for key in ("output", "input")}
+    return terminals | dict(zip(names, wiring.factors, strict=True))
 
 
-def serve(options: EmulatorOptions, on_ready: Callable[[Emulator], None]) -> None:
-    """Serve an emulator until SIGINT or SIGTERM; call ``on_ready`` once its devices answer."""
-    emulator = build(options)
+def serve(options: Sequence[EmulatorOptions], on_ready: Callable[[list[Emulator]], None]) -> None:
+    """Serve emulators until SIGINT or SIGTERM; call ``on_ready`` once all devices answer."""
+    emulators: list[Emulator] = []
+    for each in options:
+        emulators.append(build(each, beside=emulators[0] if emulators else None))
+    server, log = emulators[0].server, emulators[0].log
 
     def stop(number: int, frame: FrameType | None) -> None:
-        emulator.server.stop()
+        server.stop()
 
     gc.collect()
     gc.freeze()  # collecting all imported objects takes tens of ms
     before = {each: signal.signal(each, stop) for each in (signal.SIGINT, signal.SIGTERM)}
     try:
-        on_ready(emulator)
-        emulator.server.run()
+        on_ready(emulators)
+        server.run()
     finally:
         for number, handler in before.items():
             signal.signal(number, handler)
-        emulator.log.close()
+        log.close()

@@ -78,12 +78,22 @@ class Emulator:
         return self.sections[0]
 
 
-def build(options: EmulatorOptions, clock_ns: Callable[[], int] = time.monotonic_ns) -> Emulator:
-    """Return an emulator with open ports and one clock; raise InputError for wrong options."""
+def build(
+    options: EmulatorOptions,
+    clock_ns: Callable[[], int] = time.monotonic_ns,
+    beside: "Emulator | None" = None,
+) -> Emulator:
+    """Return an emulator with open ports and one clock; raise InputError for wrong options.
+
+    One ``beside`` another has the server and the log of that one.
+    """
     plan = _Plan(options)
     now_ns = clock_ns()
-    log = WriteLog(options.log, time.time_ns() - now_ns)
-    server = EmulatorServer(options.faults, clock_ns)
+    if beside is None:
+        log = WriteLog(options.log, time.time_ns() - now_ns)
+        server = EmulatorServer(options.faults, clock_ns)
+    else:
+        log, server = beside.log, beside.server
     rigs = plan.rigs(now_ns)
     device, reader, wires = plan.devices(rigs, log)
     try:

@@ -27,11 +27,11 @@ CONFIGS = Path(__file__).parents[4] / "configs"
 def test_it_says_where_both_answer(profile, reader, options, places):
     told = []
 
-    def on_ready(emulator):
-        told.extend(emulator.places)
+    def on_ready(emulators):
+        told.extend(place for each in emulators for place in each.places)
         signal.raise_signal(signal.SIGTERM)
 
-    serve(EmulatorOptions(profile, reader=reader, **options), on_ready)
+    serve([EmulatorOptions(profile, reader=reader, **options)], on_ready)
     assert [each.profile for each in told] == [profile, reader]
     said = (f"{each.address}" + f" unit {each.unit_id}" * bool(each.unit_id) for each in told)
     assert re.fullmatch(places, " ".join(said))
@@ -93,23 +93,22 @@ def test_options_become_the_emulator(words, tmp_path, monkeypatch):
     more = ["--log", str(log), "--fault", "cut@2", "--fault", "delay:0.3@1s", "--port", "5020"]
     ended = CliRunner().invoke(app, ["emulate", *words, *more])
     assert ended.exit_code == 0, ended.output
-    assert asked == [
-        EmulatorOptions(
-            "kepco_bop",
-            port=5020,
-            log=log,
-            faults=(parse_fault("cut@2"), parse_fault("delay:0.3@1s")),
-            reader="agilent_34970a",
-            rigs=(RigOptions(sensor="AI102"),),
-        )
-    ]
+    made = EmulatorOptions(
+        "kepco_bop",
+        port=5020,
+        log=log,
+        faults=(parse_fault("cut@2"), parse_fault("delay:0.3@1s")),
+        reader="agilent_34970a",
+        rigs=(RigOptions(sensor="AI102"),),
+    )
+    assert asked == [[made]]
 
 
 def test_it_has_the_amplifier_of_the_experiment(tmp_path):
     limit = "amplifier: {voltage_max_v: 36, resistance_ohm: 4, inductance_h: 0.003}\n"
     path = tmp_path / "rig.yaml"
     path.write_text(limit + (CONFIGS / "modbus_labjack_t7.yaml").read_text())
-    options = wired_experiment(path).options
+    (options,) = wired_experiment(path).options
     assert options.rigs[0].actuator.amplifier.voltage_max_v == 36.0
     assert options.rigs[0].limits == (-7.07, 7.07)
 
@@ -138,6 +137,74 @@ def test_an_experiment_in_volts_has_a_piezo(ended_at_once, tmp_path):
     }  # fmt: skip
 
 
+AXES = """\
+device: {kind: modbus_dac, profile: labjack_t8, host: 127.0.0.1, watchdog: none,
+  amplifier: {gain_v_per_v: 10.0}, sensor: {um_per_v: 5.0}}
+limits: {drive_v: [0.0, 50.0]}
+axes:
+  x: {device: {output: DAC0, input: AIN1}}
+  y: {device: {output: DAC1, input: AIN0}, limits: {drive_v: [0.0, 100.0]}}
+"""
+
+
+def said_of(path, *words):
+    """Return what the emulator says of an experiment with axes, and the settings to run it."""
+    ended = CliRunner().invoke(app, ["emulate", str(path), "--json", *words])
+    assert ended.exit_code == 0, ended.exception
+    said = json.loads(ended.stdout)
+    start, name, *words = said.pop("arguments")
+    assert (start, name, set(words[::2])) == ("run", str(path), {"--set"})
+    return said, words[1::2]
+
+
+class TestAxes:
+    @pytest.fixture
+    def path(self, tmp_path, ended_at_once):
+        path = tmp_path / "stage.yaml"
+        path.write_text(AXES)
+        return path
+
+    def test_axes_on_one_device_have_a_rig_each(self, path):
+        (options,) = wired_experiment(path, actuator=["axes.y.sensor_noise_um=0.1"]).options
+        x, y = options.rigs
+        assert [(each.output, each.sensor) for each in (x, y)] == [
+            ("DAC0", "AIN1"), ("DAC1", "AIN0"),
+        ]  # fmt: skip
+        assert (x.limits, y.limits) == ((0.0, 50.0), (0.0, 100.0))
+        assert x.actuator.seed != y.actuator.seed
+        assert (x.actuator.sensor_noise_um, y.actuator.sensor_noise_um) == (1e-3, 0.1)
+        said, settings = said_of(path)
+        (port,) = (each["address"].rpartition(":")[2] for each in said["devices"])
+        assert {axis: each["output"] for axis, each in said["wiring"].items()} == {
+            "x": "DAC0", "y": "DAC1",
+        }  # fmt: skip
+        assert settings == [f"axes.{axis}.device.tcp_port={port}" for axis in "xy"]
+
+    def test_axes_on_several_devices_are_served_together(self, path):
+        said, settings = said_of(path, "--set", "axes.y.device.tcp_port=5020")
+        assert len({each["address"] for each in said["devices"]}) == 2
+        port = said["devices"][0]["address"].rpartition(":")[2]
+        assert settings == ["axes.y.device.tcp_port=5020", f"axes.x.device.tcp_port={port}"]
+
+    def test_one_axis_is_emulated_alone(self, path):
+        said, settings = said_of(path, "--set", "axis=y")
+        assert said["wiring"]["output"] == "DAC1"
+        assert settings[0] == "axis=y"
+        assert settings[1].startswith("device.tcp_port=")
+
+    @pytest.mark.parametrize(("words", "key"), [
+        (["--actuator", "axes.z.seed=2"], "axes: must hold options of x and y"),
+        (["--actuator", "axes.y.sed=2"], "--actuator axes.y.sed=2, y: sed: unknown key"),
+        (["--set", "axes.y.device.output=DAC0"], "DAC0 must not have two rigs"),
+        (["--set", "axes.y.device.profile=3"], "y: device.profile: must name a profile"),
+        (["--output", "DAC0"], "--output"),
+    ])  # fmt: skip
+    def test_what_does_not_fit_is_refused(self, path, words, key):
+        ended = CliRunner().invoke(app, ["emulate", str(path), *words])
+        assert ended.exit_code != 0
+        assert key in str(ended.exception)
+
+
 @pytest.mark.parametrize(
     ("words", "key"),
     [
@@ -162,11 +229,12 @@ def test_a_port_that_no_user_may_listen_on_is_another_one(tmp_path):
     path = tmp_path / "real.yaml"
     path.write_text(text)
     wired = wired_experiment(path)
-    assert wired.options.port == 0
-    emulator = build(wired.options)
+    (options,) = wired.options
+    assert options.port == 0
+    emulator = build(options)
     try:
         port = emulator.address.rpartition(":")[2]
-        assert wired.words(emulator) == ["run", str(path), "--set", f"device.tcp_port={port}"]
+        assert wired.words([emulator]) == ["run", str(path), "--set", f"device.tcp_port={port}"]
     finally:
         emulator.server.close()
         emulator.log.close()
