@@ -46,7 +46,6 @@ class AxisChain:
         trip: Interlock that the last answer tripped.
         guarded: Whether that trip ends the run.
         no_room_at: First sample of the last answered block, if the ring had no room for it.
-        dropped: Samples dropped because the ring was full.
     """
 
     def __init__(
@@ -67,7 +66,6 @@ class AxisChain:
         self.trip: Trip | None = None
         self.guarded = True
         self.no_room_at: int | None = None
-        self.dropped = 0
         self._interlocks = Interlocks(plan.interlocks, plan.interlock_settings, sample_rate_hz)
         learners = plan.feedback, plan.adaptation, plan.conditioning
         self._learns = any(each is not None for each in learners)
@@ -310,7 +308,6 @@ class AxisChain:
             self._missing = 0
             return True
         self._missing = before + self._size
-        self.dropped += self._size
         self.no_room_at = block.head[_FIRST_SAMPLE]
         return False
 

@@ -158,7 +158,7 @@ class Loop:
             chain.record_lost_readings(last)
         confirms = all(each.info.confirms for each in self._devices)
         output: OutputState = "confirmed" if confirms else "sent"
-        return self._outcome(self._code, self._reason, output)
+        return LoopOutcome(self._code, self._reason, self._ended_at, output)
 
     def _await_trigger(self, start_ns: int) -> int:
         """Wait for the digital input, if the plan says so; return the time of the first tick.
@@ -404,11 +404,7 @@ class Loop:
         for chain in self._chains:
             chain.pass_on_unanswered()
             chain.record_adapted(last, ended=True)
-        return self._outcome("fault", text, state)
-
-    def _outcome(self, code: Code, reason: str, output: OutputState) -> LoopOutcome:
-        dropped = sum(each.dropped for each in self._chains)
-        return LoopOutcome(code, reason, self._ended_at, output, dropped)
+        return LoopOutcome("fault", text, self._ended_at, state)
 
     def _seconds(self) -> float:
         return self._clock.now_ns() * 1e-9

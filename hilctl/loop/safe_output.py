@@ -62,14 +62,12 @@ class LoopOutcome:
         reason: One line of text.
         ended_at: Index after the last sample that was sent.
         output: State of the output.
-        dropped: Samples that were exchanged but not recorded because the ring was full.
     """
 
     code: Code
     reason: str
     ended_at: int
     output: OutputState
-    dropped: int
 
     @property
     def safe(self) -> bool:

@@ -143,8 +143,13 @@ def sha256_of(text: str) -> str:
     return hashlib.sha256(text.encode()).hexdigest() if text else ""
 
 
-def end_facts(outcome: LoopOutcome, counters: Lateness, lost_events: int = 0) -> dict[str, str]:
-    """Return the outcome of a run and its counters as text."""
+def end_facts(
+    outcome: LoopOutcome, counters: Lateness, dropped: int = 0, lost_events: int = 0
+) -> dict[str, str]:
+    """Return the outcome of a run and its counters as text.
+
+    ``dropped`` samples of the axis were exchanged but not recorded because its ring was full.
+    """
     return {
         "code": outcome.code,
         "reason": outcome.reason,
@@ -155,7 +160,7 @@ def end_facts(outcome: LoopOutcome, counters: Lateness, lost_events: int = 0) ->
         "worst_late_ns": str(counters.worst_ns),
         "worst_late_tick": str(counters.worst_tick),
         "longest_late_run": str(counters.longest_run),
-        "dropped_in_ring": str(outcome.dropped),
+        "dropped_in_ring": str(dropped),
         "lost_events": str(lost_events),
     }
 

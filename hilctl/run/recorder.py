@@ -446,7 +446,7 @@ class AxisRecording:
                 self._record(batch)
             ended_at = max(recorder.next_sample, page.get(PageField.ENDED_AT))
             outcome = replace(outcome, ended_at=ended_at)
-        facts = end_facts(outcome, self._page.lateness(), page.get(PageField.EVENTS_LOST))
+        facts = end_facts(outcome, self._page.lateness(), *page.losses())
         facts |= usage_facts(self._page.usage(), ProcessUsage.now().since(before))
         recorder.finish(facts, outcome.ended_at)
 

@@ -21,7 +21,7 @@ from hilctl.run.run_folder import RunFolder, runs, taken_over
 from hilctl.run.shared.ring import SampleRing, safe_result_of
 from hilctl.run.shared.shared_page import PageField, PageSlot, Phase, SharedPage
 
-_DIED = LoopOutcome("fault", "supervisor and loop died", 0, "unknown", 0)
+_DIED = LoopOutcome("fault", "supervisor and loop died", 0, "unknown")
 _RESULT_S = 1.0
 _POLL_S = 0.02
 
@@ -143,7 +143,7 @@ def _recover_axis(
     else:
         batches = _batches_in(ring, ended=page.observe(PageField.PHASE) == Phase.ENDED)
         events = ring.page.pop_events()
-        end = end_facts(outcome, page.lateness(), ring.page.get(PageField.EVENTS_LOST))
+        end = end_facts(outcome, page.lateness(), *ring.page.losses())
     try:
         recovered = recover_recording(path, batches, end, events=events, ended_at=outcome.ended_at)
     except (HilctlError, OSError) as error:

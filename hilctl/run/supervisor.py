@@ -197,7 +197,7 @@ class RunMonitor:
             output = describe(result.output, result.error)
             if not result.confirmed and not reason.endswith(output):
                 reason += f"; {output}"
-            last = said or LoopOutcome("fault", "", 0, "unknown", 0)
+            last = said or LoopOutcome("fault", "", 0, "unknown")
             self.outcome = replace(last, code="fault", reason=reason, output=result.output)
         if self.outcome is not None:
             self._recording.end(self.outcome, lost_loop=result is not None and said is None)

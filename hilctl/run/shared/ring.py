@@ -41,6 +41,7 @@ _LINE = 64
 # Plain integers: access to an enumeration's member takes longer than the write.
 _SENT, _HEAD, _TAIL = int(PageField.SENT), int(PageField.HEAD), int(PageField.TAIL)
 _ENDED_AT, _EXCHANGING = int(PageField.ENDED_AT), int(PageField.EXCHANGING)
+_DROPPED = int(PageField.DROPPED)
 _SEQUENCE, _FIRST_SAMPLE = int(BlockHeader.SEQUENCE), int(BlockHeader.FIRST_SAMPLE)
 _HEAD_NUMBERS = len(BlockHeader)
 _MAGIC = 0x48494C43_52494E48
@@ -179,6 +180,7 @@ class SampleRing:
         """Hand a block to the consumer; return False if it is in a spare slot."""
         self._numbers[_EXCHANGING] = 0
         if block.number < 0:
+            self._numbers[_DROPPED] += self.block
             return False
         block.head[_SEQUENCE] = block.number + 1
         self._publish(self._integers, _HEAD, block.number + 1)

@@ -73,6 +73,7 @@ class PageField(IntEnum):
     LONGEST_LATE_RUN = 36
     WAVEFORM_AT = 37
     EXCHANGING = 38
+    DROPPED = 39
     EVENT_HEAD = 40
     EVENT_TAIL = 41
     EVENTS_LOST = 42
@@ -253,6 +254,10 @@ class SharedPage:
         """Write the counters of late ticks."""
         for field, count in zip(_LATENESS, astuple(lateness), strict=True):
             self.put(field, count)
+
+    def losses(self) -> tuple[int, int]:
+        """Return the samples and the events for which ring and page had no room."""
+        return self.get(PageField.DROPPED), self.get(PageField.EVENTS_LOST)
 
     def usage(self) -> ProcessUsage | None:
         """Return the resource usage of the loop process, or None."""

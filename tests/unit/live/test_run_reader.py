@@ -95,7 +95,7 @@ def test_status_is_json(run):
     assert sum(status["lateness_counts"]) == 100
     ring.page.put(PageField.STOP, Stop.REQUEST)
     assert feed.state == "stopping"
-    ring.page.leave_outcome(LoopOutcome("stopped", "by hilctl stop", 5000, "confirmed", 0))
+    ring.page.leave_outcome(LoopOutcome("stopped", "by hilctl stop", 5000, "confirmed"))
     assert feed.status()["reason"] == "by hilctl stop"
     assert feed.state == "stopped"
 

@@ -141,7 +141,7 @@ def test_a_start_that_is_refused_moves_nothing(broken, output):
     assert page.get(PageField.PHASE) == Phase.STARTING
 
 
-OUTCOME = LoopOutcome("completed", "waveform completed", 7, "confirmed", 0)
+OUTCOME = LoopOutcome("completed", "waveform completed", 7, "confirmed")
 REFUSED = (SetUpStep("fifo", "failed", "not permitted", "raise rtprio"),)
 
 

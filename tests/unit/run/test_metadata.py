@@ -32,7 +32,7 @@ from hilctl.run.shared.shared_page import SIZE, SharedPage
 from hilctl.run.start import checked_experiment
 
 EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
-OUTCOME = LoopOutcome("stopped", "asked to", 400, "confirmed", 50)
+OUTCOME = LoopOutcome("stopped", "asked to", 400, "confirmed")
 COUNTERS = Lateness(late_ticks=1, skipped_ticks=2, worst_ns=3, worst_tick=4, longest_run=5)
 FACTS = {
     "code": "stopped",
@@ -49,10 +49,10 @@ FACTS = {
 
 
 def test_end_has_every_counter():
-    assert end_facts(OUTCOME, COUNTERS) == {**FACTS, "lost_events": "0"}
+    assert end_facts(OUTCOME, COUNTERS, 50) == {**FACTS, "lost_events": "0"}
     page = SharedPage(mmap(-1, SIZE))
     page.leave_lateness(COUNTERS)
-    assert end_facts(OUTCOME, page.lateness(), 6) == {**FACTS, "lost_events": "6"}
+    assert end_facts(OUTCOME, page.lateness(), 50, 6) == {**FACTS, "lost_events": "6"}
 
 
 def test_every_column_has_its_unit():

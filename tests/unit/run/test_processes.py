@@ -167,7 +167,7 @@ def test_relieved_runs_with_unrecorded_samples_are_kept(left):
 
 @pytest.mark.parametrize("settle", [
     lambda page: page.put(PageField.GUARDIAN_PHASE, GuardianPhase.DONE),
-    lambda page: page.leave_outcome(LoopOutcome("completed", "", 7, "confirmed", 0)),
+    lambda page: page.leave_outcome(LoopOutcome("completed", "", 7, "confirmed")),
     lambda page: page.put(PageField.GO, 0),
 ], ids=["guardian ended", "loop ended", "never started"])  # fmt: skip
 def test_a_run_whose_output_is_safe_needs_no_relief(left, settle):

@@ -268,7 +268,7 @@ def test_a_recording_that_is_deleted_before_the_start_is_refused(on_a_disk):
     on_a_disk.discard()
 
 
-ENDED = LoopOutcome("completed", "waveform completed", 8, "confirmed", 0)
+ENDED = LoopOutcome("completed", "waveform completed", 8, "confirmed")
 
 
 class RecorderDouble:
@@ -308,6 +308,7 @@ class RecorderDouble:
 
     def finish(self, facts, ended_at):
         self.finished = (facts["reason"], ended_at)
+        self.facts = facts
 
 
 @pytest.fixture
@@ -386,7 +387,7 @@ def test_sent_blocks_of_a_dead_loop_are_recorded_as_unanswered(ring, recording):
     exchange(ring, 4)
     exchange(ring, 2, answered=False)
     ring._area.heads[1, BlockHeader.SEQUENCE] = 77
-    recording.end(LoopOutcome("fault", "it died", 0, "confirmed", 0), lost_loop=True)
+    recording.end(LoopOutcome("fault", "it died", 0, "confirmed"), lost_loop=True)
     recording._finish()
     assert recording.recorders[0].firsts == [0, 2, 3, 4, 5]
     assert recording.recorders[0].finished == ("it died", 6)
@@ -403,6 +404,17 @@ def test_error_of_the_recorder_thread_is_reported_and_the_recording_ended(ring, 
     recording._thread.join(30.0)
     assert recording.finished
     assert recording.recorders[0].finished == ("waveform completed", 8)
+
+
+def test_each_axis_counts_its_own_dropped_samples(ring, tmp_path):
+    other = SampleRing.create(tmp_path / "ring-1", slots=2, block=1, state_size=1)
+    recording = RingRecorder([ring, other], [RecorderDouble(), RecorderDouble()], flush_s=0.0)
+    exchange(ring, 5)
+    exchange(other, 2)
+    other.answered(other.claim())
+    recording.end(ENDED, lost_loop=False)
+    recording._finish()
+    assert [each.facts["dropped_in_ring"] for each in recording.recorders] == ["0", "1"]
 
 
 def test_marks_are_accepted_while_they_can_be_recorded(ring, recording):

@@ -59,7 +59,7 @@ def test_run_without_a_ring_is_not_safe(dead):
 def test_outcome_of_a_loop_that_ramped_down_counts(dead):
     def fill(folder):
         page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
-        ended = LoopOutcome("stopped", "stopped because the supervisor died", 0, "confirmed", 0)
+        ended = LoopOutcome("stopped", "stopped because the supervisor died", 0, "confirmed")
         page.write_text(PageSlot.OUTCOME, json.dumps(asdict(ended)))
         page.put(PageField.PHASE, Phase.ENDED)
         page.put(PageField.GO, 1)

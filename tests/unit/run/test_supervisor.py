@@ -92,7 +92,7 @@ def test_a_signal_has_priority_over_an_error_of_the_supervisor(run, number, stop
 
 def test_outcome_of_the_loop_counts_after_its_process_has_ended(run):
     """Before, it may still be closing its device."""
-    outcome = LoopOutcome("completed", "waveform completed", 7, "confirmed", 0)
+    outcome = LoopOutcome("completed", "waveform completed", 7, "confirmed")
     run.page.leave_outcome(outcome)
     run.started.poll(0)
     assert run.ended == []
@@ -150,14 +150,14 @@ def test_outcome_of_a_slow_exchange_names_the_limit(
 
 
 def test_outcome_of_a_loop_that_lost_its_device_is_kept(run):
-    run.page.leave_outcome(LoopOutcome("fault", "no answer", 7, "unknown", 3))
+    run.page.leave_outcome(LoopOutcome("fault", "no answer", 7, "unknown"))
     run.child.ended = True
     run.started.poll(0)
     assert run.ended == []
     run.safety.result, run.safety.by = SafeActionResult(False, "confirmed"), "guardian"
     run.started.poll(0)
     ((outcome, lost_loop),) = run.ended
-    assert (outcome.output, outcome.ended_at, outcome.dropped) == ("confirmed", 7, 3)
+    assert (outcome.output, outcome.ended_at) == ("confirmed", 7)
     assert outcome.reason.startswith("no answer; the guardian set")
     assert not lost_loop
 

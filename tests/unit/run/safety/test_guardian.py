@@ -128,7 +128,7 @@ def guarded(tmp_path):
 
 
 def gave_up(page, output):
-    page.leave_outcome(LoopOutcome("fault", "no answer", 7, output, 0))
+    page.leave_outcome(LoopOutcome("fault", "no answer", 7, output))
 
 
 @pytest.mark.parametrize("left", [
@@ -194,7 +194,7 @@ def test_killed_loop_may_finish_a_call_before_the_device_is_touched(guarded, mon
 
 
 def test_guardian_accepts_the_outcome_of_the_loop(guarded):
-    guarded.page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed", 0))
+    guarded.page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed"))
     guarded.loop.kill()
     guarded.guard()
     assert guarded.device.asked == []
@@ -202,7 +202,7 @@ def test_guardian_accepts_the_outcome_of_the_loop(guarded):
 
 
 def test_loop_stopped_after_its_end_is_only_killed(guarded):
-    guarded.page.leave_outcome(LoopOutcome("completed", "completed", 7, "confirmed", 0))
+    guarded.page.leave_outcome(LoopOutcome("completed", "completed", 7, "confirmed"))
     guarded.loop.send_signal(signal.SIGSTOP)
     os.waitid(os.P_PID, guarded.loop.pid, os.WSTOPPED | os.WNOWAIT)
     guarded.guard(hang_s=0.03)

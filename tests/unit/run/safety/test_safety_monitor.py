@@ -248,7 +248,7 @@ def test_run_ends_if_no_process_can_act(run, monkeypatch, how):
 
 
 def test_loop_with_an_outcome_is_left_alone(run, page):
-    page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed", 0))
+    page.leave_outcome(LoopOutcome("completed", "waveform completed", 7, "confirmed"))
     run.guardians[0].ended = True  # as it does by itself
     for _ in range(5):
         run.look(ended=True, awake=False, passed_ms=100)

@@ -58,6 +58,7 @@ def test_full_ring_refuses_and_keeps_what_it_has(tmp_path):
     assert not push(ring, 9)
     other.release()
     assert push(ring, 9)
+    assert other.page.losses() == (3 * BLOCK, 0)
 
 
 def test_many_blocks_are_read_in_batches(tmp_path, monkeypatch):

@@ -47,7 +47,7 @@ def test_events_are_read_once_and_truncated(sides):
 
 def test_outcome_counts_only_at_the_end(sides):
     one, other = sides
-    outcome = LoopOutcome("stopped", "stopped by a test", 7, "confirmed", 2)
+    outcome = LoopOutcome("stopped", "stopped by a test", 7, "confirmed")
     one.write_text(PageSlot.OUTCOME, json.dumps(asdict(outcome)))
     assert other.outcome() is None
     one.put(PageField.PHASE, Phase.ENDED)
