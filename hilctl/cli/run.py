@@ -332,6 +332,9 @@ def _supervised_rows(checked: CheckedExperiment) -> dict[str, str]:
     if interlocks.tracking_error_um is not None:
         more = f"more{for_longer_than(interlocks.tracking_s)} ends the run"
         rows["tracking error"] = f"at most {interlocks.tracking_error_um:g} µm; {more}"
+    if (apart := config.apart) is not None:
+        more = f"more{for_longer_than(apart.for_s)} ends the run"
+        rows["apart"] = f"{' and '.join(apart.axes)} at most {apart.um:g} µm; {more}"
     if aux := checked.loaded.rig.aux:
         rows["auxiliary"] = "; ".join(f"{each.channel.name}: {each}" for each in aux)
     if (trigger := _trigger(checked)) is not None:

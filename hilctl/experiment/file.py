@@ -26,6 +26,7 @@ from hilctl.experiment.sections.safe import Safe
 from hilctl.experiment.sections.timing import Timing
 from hilctl.experiment.sections.trigger import Trigger
 from hilctl.loop.adaptation import AdaptationBounds
+from hilctl.loop.interlocks import ApartSettings
 from hilctl.loop.limiter import CommandLimits
 from hilctl.machine.rt_setup import Realtime
 from hilctl.waveforms.spec import AnyWaveform
@@ -69,6 +70,7 @@ class Experiment(StrictModel):
         adaptation: Adaptation of the compensator's model during the run. Default: none.
         trigger: Digital output at marks of the waveform, and start by a digital input. Default:
             none. Of several axes, the first one has the marks and the channels.
+        apart: Interlock on the difference of the displacements of two axes. Default: none.
         limits: Limits of the run.
         safe: The safe value, and the safe ramp to it.
         timing: Policy for late ticks.
@@ -95,6 +97,7 @@ class Experiment(StrictModel):
     feedback: FeedbackConfig | None = None
     adaptation: AdaptationConfig | None = None
     trigger: Trigger | None = None
+    apart: ApartSettings | None = None
     limits: Limits
     safe: Safe = Field(default_factory=Safe)
     timing: Timing = Field(default_factory=Timing)

@@ -35,6 +35,7 @@ from hilctl.experiment.sections.adaptation import (
     at_worst,
     worst_inputs,
 )
+from hilctl.experiment.sections.apart import apart_notes, apart_problems
 from hilctl.experiment.sections.compensator import (
     CompensatorStart,
     finite_problems,
@@ -183,7 +184,8 @@ def check_axes(loaded: Sequence[LoadedExperiment], heat_a2: float | None = 0.0) 
         raise ConfigError(found)
     samples = [each.reference.values.size for each in axes]
     longest = axes[samples.index(max(samples))]
-    notes = []
+    limits = {each.axis: each.config.command_limits() for each in loaded}
+    notes = [*apart_notes(loaded[0].config.apart, limits)]
     for k, each in enumerate(axes):
         if samples[k] < max(samples):
             axes[k] = check(each.loaded, heat_a2, now, hold_until=max(samples))
@@ -201,6 +203,7 @@ def _joint_problems(loaded: Sequence[LoadedExperiment]) -> Iterator[ConfigProble
         return
     found = [*output_problems(infos)]
     found += clock_problems(infos, config.sample_rate_hz, config.block)
+    found += [(loaded[0].axis, each) for each in apart_problems(config.apart, [*infos])]
     for axis, problem in found:
         yield from documents[axis].refusal([problem]).problems
 
@@ -281,6 +284,8 @@ def _section_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
     yield from trigger_problems(config.trigger, rig)
     yield from zero_problems(zero=config.zero, offset=config.measures_offset)
     yield from condition_problems(config.condition, rig)
+    if not loaded.axis:
+        yield from apart_problems(config.apart, [])
 
 
 def _rest(loaded: LoadedExperiment) -> float:

@@ -25,6 +25,8 @@ class InterlockFlag(IntFlag):
     """The displacement was too far from the reference for too long."""
     AUX = 1024
     """An auxiliary channel was outside its limits, or missing for too long; checked per block."""
+    APART = 2048
+    """The displacements of two axes differed by too much for too long."""
 
 
 (
@@ -43,6 +45,7 @@ _FROZEN = int(InterlockFlag.SENSOR_FROZEN)
 _DEVIATION = int(InterlockFlag.DEVIATION)
 _THERMAL = int(InterlockFlag.THERMAL)
 _TRACKING = int(InterlockFlag.TRACKING_ERROR)
+_APART = int(InterlockFlag.APART)
 
 
 @kernel(inline=True)
@@ -151,6 +154,36 @@ def interlock_block(
         flags[k] |= trips
         if first < 0 < trips:
             first = k
+    return first
+
+
+@kernel()
+def apart_block(
+    most_um: float,
+    samples: float,
+    run: F64,
+    first_um: F64,
+    second_um: F64,
+    first_flags: U32,
+    second_flags: U32,
+) -> int:
+    """Compare the displacements of two axes; return the index of the first trip, or -1.
+
+    It trips if they are more than ``most_um`` apart in more than ``samples`` consecutive samples,
+    counted in ``run``, float64[1]. A sample without both readings (NaN) does not count.
+    Displacements are float64[n]; the bit of each tripped sample is added to the flags of both axes,
+    uint32[n].
+    """
+    first = -1
+    for k in range(first_um.size):
+        apart_um = abs(first_um[k] - second_um[k])
+        if apart_um == apart_um:
+            run[0] = run[0] + 1.0 if apart_um > most_um else 0.0
+            if run[0] > samples:
+                first_flags[k] |= _APART
+                second_flags[k] |= _APART
+                if first < 0:
+                    first = k
     return first
 
 

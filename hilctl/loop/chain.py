@@ -43,6 +43,7 @@ class AxisChain:
         limiter: Limiter with the last command.
         lead_in: Initial ramp and conditioning before the waveform.
         invalid: Index of this tick's first requested command that is not finite, or -1.
+        answered: Block that the last exchange answered, until it is passed on; None without one.
         trip: Interlock that the last answer tripped.
         guarded: Whether that trip ends the run.
         no_room_at: First sample of the last answered block, if the ring had no room for it.
@@ -63,6 +64,7 @@ class AxisChain:
         self.lead_in = LeadIn(None, 0)
         self.block: Block
         self.invalid = -1
+        self.answered: Block | None = None
         self.trip: Trip | None = None
         self.guarded = True
         self.no_room_at: int | None = None
@@ -74,7 +76,6 @@ class AxisChain:
         self._size, self._latency_blocks = block, latency_blocks
         self._attributes = [name for name, there in _has(device).items() if there]
         self._in_flight: deque[Block] = deque()
-        self._answered: Block | None = None
         self._missing = 0  # samples dropped since the last recorded block
 
     @property
@@ -208,14 +209,11 @@ class AxisChain:
         for name in self._attributes:
             getattr(answered, name)[:] = getattr(self.device, name)
         early = len(in_flight) <= self._latency_blocks
-        self._answered = None if early else in_flight.popleft()
+        self.answered = None if early else in_flight.popleft()
 
     def take(self) -> bool:
-        """Check an answered block, update feedback and adaptation, and pass it on to be recorded.
-
-        Return whether an interlock tripped or the ring had no room for the block.
-        """
-        if (block := self._answered) is None:
+        """Check an answered block, and update feedback and adaptation; return whether it trips."""
+        if (block := self.answered) is None:
             return False
         if self._learns:
             # Before the interlocks, because it may zero the displacement.
@@ -229,8 +227,12 @@ class AxisChain:
                 self.plan.adaptation.take(block)
         if trip is not None:
             self.trip, self.guarded = trip, block.guarded
-        # Before a fault is recorded: its event refers to recorded samples.
-        return not self._pass_on(block) or trip is not None
+        return trip is not None
+
+    def pass_on(self) -> bool:
+        """Pass an answered block on to be recorded; return whether the ring had no room for it."""
+        block, self.answered = self.answered, None
+        return block is not None and not self._pass_on(block)
 
     def remove_offset(self, sample: int) -> str:
         """Remove the offset between sensor and model; return why the run must end, if it must.
@@ -292,8 +294,7 @@ class AxisChain:
 
     def pass_on_unanswered(self) -> None:
         """Pass on the blocks of a lost device, marked as unanswered."""
-        if self._answered is not None:
-            self._pass_on(self._answered)
+        self.pass_on()
         for block in self._in_flight:
             if block.due:
                 block.columns[ANSWERS] = block.aux[:] = np.nan
@@ -302,7 +303,6 @@ class AxisChain:
 
     def _pass_on(self, block: Block) -> bool:
         """Pass a block on to be recorded, with the samples dropped before it."""
-        self._answered = None
         block.head[_DROPPED_BEFORE] = before = self._missing + block.skipped
         if self.lane.answered(block):
             self._missing = 0

@@ -29,6 +29,7 @@ TripCode: TypeAlias = Literal[
     "thermal",
     "tracking_error",
     "aux",
+    "apart",
 ]
 
 _FIRST_SAMPLE = int(BlockHeader.FIRST_SAMPLE)
@@ -124,6 +125,20 @@ class InterlockSettings(StrictModel):
     def measured_deviation(self) -> float | None:
         """Largest difference of measured command and command, in the command's unit."""
         return self.measured_deviation_a or self.measured_deviation_v
+
+
+class ApartSettings(StrictModel):
+    """Interlock on the difference of the displacements of two axes, for a run with ``axes``.
+
+    Attributes:
+        axes: Names of the two axes.
+        um: Largest difference of their displacements, um.
+        for_s: Time for which the difference may be larger, s.
+    """
+
+    axes: tuple[str, str]
+    um: _Positive
+    for_s: _NotNegative = 0.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -340,6 +355,33 @@ class Interlocks:
         return Trip(sample, "deviation", text)
 
 
+class ApartInterlock:
+    """Compare the displacements of two axes, block by block."""
+
+    def __init__(self, settings: ApartSettings, sample_rate_hz: float) -> None:
+        self._settings = settings
+        self._limits = settings.um, _in_samples(settings.for_s, sample_rate_hz)
+        self._run = np.zeros(1)
+        self._apart_block = compiled(kernels.apart_block)
+
+    def judge(self, first: Block, second: Block) -> Trip | None:
+        """Check the next block of both axes, of the same samples; return its first trip, or None.
+
+        Samples skipped before it count as time with constant displacements.
+        """
+        if self._run[0]:
+            self._run[0] += first.skipped
+        both_um = first.displacement_um, second.displacement_um
+        k = self._apart_block(*self._limits, self._run, *both_um, first.flags, second.flags)
+        if k < 0:
+            return None
+        sample, settings = first.head[_FIRST_SAMPLE] + k, self._settings
+        apart_um = both_um[1].item(k) - both_um[0].item(k)
+        away = f"{apart_um:+.4g} µm from {settings.axes[0]} at sample {sample}"
+        beyond = f"beyond {settings.um:g} µm{for_longer_than(settings.for_s)}"
+        return Trip(sample, "apart", f"displacement {away} is {beyond}")
+
+
 def warming(time_constant_s: float, sample_rate_hz: float) -> float:
     """Return the fraction of the remaining heating of a coil that one sample adds."""
     return -math.expm1(-1.0 / (time_constant_s * sample_rate_hz))
@@ -350,18 +392,18 @@ def for_longer_than(time_s: float | None) -> str:
     return f" for longer than {time_s:g} s" if time_s else ""
 
 
+def _in_samples(time_s: float, rate_hz: float) -> float:
+    """Return a time in samples, rounded up; infinite if it is infinite."""
+    count = time_s * rate_hz
+    return float(math.ceil(round(count, 6))) if math.isfinite(count) else math.inf
+
+
 def _or_inf(value: float | None) -> float:
     return math.inf if value is None else value
 
 
 def _numbers(context: InterlockContext, given: InterlockSettings, rate_hz: float) -> F64:
     """Return the settings of the kernel: float64[kernels.SETTINGS]."""
-
-    def samples(time_s: float) -> float:
-        """Return a time in samples, rounded up; infinite if it is infinite."""
-        count = time_s * rate_hz
-        return float(math.ceil(round(count, 6))) if math.isfinite(count) else math.inf
-
     deviation = _or_inf(given.measured_deviation)
     # A NaN exceeds any deviation, even an infinite one: the infinite time disables the interlock.
     deviation_s = given.deviation_s or 0.0 if math.isfinite(deviation) else math.inf
@@ -370,12 +412,12 @@ def _numbers(context: InterlockContext, given: InterlockSettings, rate_hz: float
     numbers[[kernels.RAIL_LOW, kernels.RAIL_HIGH]] = context.sensor_um
     numbers[kernels.FROZEN_UM] = given.frozen_um or 0.0
     numbers[kernels.FROZEN_TRAVEL] = context.frozen_travel
-    numbers[kernels.FROZEN_SAMPLES] = samples(_or_inf(given.frozen_s))
+    numbers[kernels.FROZEN_SAMPLES] = _in_samples(_or_inf(given.frozen_s), rate_hz)
     numbers[kernels.DEVIATION] = deviation
-    numbers[kernels.DEVIATION_SAMPLES] = samples(deviation_s)
+    numbers[kernels.DEVIATION_SAMPLES] = _in_samples(deviation_s, rate_hz)
     numbers[kernels.WARMING] = warming(given.thermal_time_constant_s or 1.0, rate_hz)
     numbers[kernels.BUDGET] = _or_inf(given.rms_current_a) ** 2
     numbers[kernels.TRACKING_UM] = _or_inf(given.tracking_error_um)
-    numbers[kernels.TRACKING_SAMPLES] = samples(given.tracking_s or 0.0)
-    numbers[kernels.MISSING_SAMPLES] = samples(given.sensor_invalid_s or 0.0)
+    numbers[kernels.TRACKING_SAMPLES] = _in_samples(given.tracking_s or 0.0, rate_hz)
+    numbers[kernels.MISSING_SAMPLES] = _in_samples(given.sensor_invalid_s or 0.0, rate_hz)
     return numbers

@@ -19,6 +19,7 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import OFFSET, TRIGGERED, Event
 from hilctl.base.samples import Flag
 from hilctl.loop.chain import AxisChain, JointChains
+from hilctl.loop.interlocks import ApartInterlock
 from hilctl.loop.pacer import Lateness, Pacer
 from hilctl.loop.plan import Host, LoopPlan
 from hilctl.loop.safe_output import (
@@ -75,6 +76,11 @@ class Loop:
         ]  # fmt: skip
         self._exchanges = _exchanges(self._chains, units or {})
         self._controlled = [each for each in self._chains if each.plan.feedback is not None]
+        self._apart: ApartInterlock | None = None
+        if plan.apart is not None:
+            self._apart = ApartInterlock(plan.apart, plan.sample_rate_hz)
+            by_name = {each.plan.name: each for each in self._chains}
+            self._pair = [by_name[name] for name in plan.apart.axes]
         self._adapts = any(each.plan.adaptation is not None for each in self._chains)
         self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
         self._start_ns = 0
@@ -308,8 +314,26 @@ class Loop:
         refused = False
         for chain in chains:
             refused |= chain.take()
+        if self._apart is not None:
+            refused |= self._check_apart(self._apart)
+        # Before a fault is recorded: its event refers to recorded samples.
+        for chain in chains:
+            refused |= chain.pass_on()
         if refused:
             self._act_on_answers()
+
+    def _check_apart(self, apart: ApartInterlock) -> bool:
+        """Check the difference of two axes; return whether it trips, as an interlock of the second.
+
+        A trip of the second axis alone takes precedence.
+        """
+        first, second = self._pair
+        if first.answered is None or second.answered is None:
+            return False
+        trip = apart.judge(first.answered, second.answered)
+        if trip is not None and second.trip is None:
+            second.trip, second.guarded = trip, second.answered.guarded
+        return trip is not None
 
     def _act_on_answers(self) -> None:
         """Begin the safe ramp if an interlock tripped or a block had no room."""

@@ -11,7 +11,7 @@ from hilctl.loop.adaptation import Adaptation
 from hilctl.loop.block import Block
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.feedback import Controller
-from hilctl.loop.interlocks import InterlockContext, InterlockSettings
+from hilctl.loop.interlocks import ApartSettings, InterlockContext, InterlockSettings
 from hilctl.loop.lead_in import Conditioning
 from hilctl.loop.limiter import CommandLimits
 from hilctl.loop.pacer import LatePolicy, LateRules
@@ -52,6 +52,7 @@ class LoopPlan:
         late_policy: Policy for late ticks in waveform and safe ramp. If the host paces the device,
             ``skip``: otherwise the ramp would take long on a slow one.
         keep_all: Whether dropping a block because the ring is full ends the run.
+        apart: Interlock on the difference of two axes, or None.
     """
 
     axes: tuple[AxisPlan, ...]
@@ -62,6 +63,7 @@ class LoopPlan:
     late_rules: LateRules = field(default_factory=LateRules)
     triggers: Triggers | None = None
     keep_all: bool = True
+    apart: ApartSettings | None = None
 
     @property
     def start_policy(self) -> LatePolicy:

@@ -75,4 +75,5 @@ def assemble(
         late_rules=late_rules(config.timing, config.tick_s, ticks) if paced else LateRules(),
         triggers=None if config.trigger is None else config.trigger.of(segments),
         keep_all=config.recording.on_failure == "stop",
+        apart=config.apart,
     )

@@ -10,6 +10,7 @@ import yaml
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
+from hilctl.kernels.interlock import InterlockFlag
 from hilctl.recording.reader import read
 from hilctl.run.run_folder import runs
 from hilctl.run.start import checked_run, start_run
@@ -108,6 +109,26 @@ def test_an_interlock_of_one_axis_ramps_both_down_from_the_same_sample(tmp_path,
     ]  # fmt: skip
     assert {each.samples.command[-1] for each in found} == {0.0}
     assert all(replay(each).identical for each in found)
+
+
+@pytest.mark.parametrize("run", [unpaced, paced])
+def test_a_gantry_ends_if_one_rod_moves_further(tmp_path, run):
+    gantry = STAGE.with_name("gantry.yaml")
+    assert run(gantry, SHORT, tmp_path / "equal.mcap").code == "completed"
+    other = [*SHORT, "axes.right.device.vary.strain=1.2"]
+    result = run(gantry, other, tmp_path / "other.mcap")
+    assert (result.code, result.reason[:7]) == ("fault", "right: ")
+    left, right = (read(each) for each in result.recordings)
+    for each in (left, right):
+        assert {event.code for event in each.events} == {"apart", "run_ended"}
+        assert each.end["reason"] == result.reason
+        assert replay(each).identical
+    tripped = [np.flatnonzero(each.samples.flags & InterlockFlag.APART) for each in (left, right)]
+    assert tripped[0].tolist() == tripped[1].tolist()
+    um = np.abs(left.samples.displacement_um - right.samples.displacement_um)
+    first = tripped[0][0]
+    assert (um[first - 50 : first + 1] > 5.0).all()  # for longer than 1 ms
+    assert um[first - 51] <= 5.0
 
 
 def test_conditioning_of_one_axis_is_waited_for_by_the_other(tmp_path):

@@ -108,6 +108,36 @@ def test_a_problem_of_one_axis_names_it_and_the_line(stage):
     assert {(each.where, each.key) for each in refused(path)} == {(f"{path}:12, y", "device.seed")}
 
 
+@pytest.mark.parametrize(("apart", "key"), [
+    ("{axes: [x, z], um: 5.0}", "apart.axes"),
+    ("{axes: [x, x], um: 5.0}", "apart.axes"),
+    ("{axes: [x], um: 5.0}", "apart.axes.1"),
+    ("{axes: [x, y], um: 0.0}", "apart.um"),
+    ("{axes: [x, y], um: 5.0, for_s: -1.0}", "apart.for_s"),
+    ("{axes: [x, y]}", "apart.um"),
+])  # fmt: skip
+def test_wrong_limits_of_a_difference(stage, apart, key):
+    path = stage("trigger: {output: cycle}", f"apart: {apart}")
+    (problem,) = refused(path)
+    assert problem.key == key
+    assert problem.where == f"{path}:6"
+
+
+def test_a_difference_needs_axes(stage):
+    apart = "apart={axes: [x, y], um: 5.0}"
+    assert [each.key for each in refused(CONFIGS / "terfenol_sine_6a.yaml", apart)] == ["apart"]
+    path = stage("trigger: {output: cycle}", "apart: {axes: [x, y], um: 5.0}")
+    assert load_experiment(path, ["axis=x"]).config.apart is None
+    assert {each.config.apart.um for each in load_axes(path)} == {5.0}
+
+
+def test_unequal_safe_ramps_are_noted(stage):
+    path = stage("trigger: {output: cycle}", "apart: {axes: [x, y], um: 5.0}")
+    notes = len(check_axes(load_axes(path)).notes)
+    slower = ["axes.y.safe={ramp_s: 3.0}"]
+    assert len(check_axes(load_axes(path, slower)).notes) == notes + 1
+
+
 def test_a_problem_of_all_axes_is_listed_once(stage):
     path = stage("1e6", "-1")
     assert [each.where for each in refused(path)] == [f"{path}:7"]

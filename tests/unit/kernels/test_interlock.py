@@ -11,7 +11,7 @@ from hilctl.kernels.interlock import InterlockFlag, heat_block, interlock_block
 
 N = 400
 SETTINGS = np.array([-8.0, 8.0, -9.0, 9.0, 0.0, 0.5, 3.0, 0.2, 2.0, 0.01, 1.5, 4.0, 2.0, 1.0])
-ALL = Flag.SENSOR_INVALID | (sum(InterlockFlag) - InterlockFlag.AUX)
+ALL = Flag.SENSOR_INVALID | (sum(InterlockFlag) - InterlockFlag.AUX - InterlockFlag.APART)
 
 
 def columns():
