@@ -184,15 +184,15 @@ def check_axes(loaded: Sequence[LoadedExperiment], heat_a2: float | None = 0.0) 
         raise ConfigError(found)
     samples = [each.reference.values.size for each in axes]
     longest = axes[samples.index(max(samples))]
-    limits = {each.axis: each.config.command_limits() for each in loaded}
-    notes = [*apart_notes(loaded[0].config.apart, limits)]
+    notes = []
     for k, each in enumerate(axes):
         if samples[k] < max(samples):
             axes[k] = check(each.loaded, heat_a2, now, hold_until=max(samples))
             ends = f"{each.loaded.axis} ends after {each.forecast.duration_s:g} s"
             until = f"{longest.loaded.axis} ends after {longest.forecast.duration_s:g} s"
             notes.append(f"{ends} and holds its last value until {until}")
-    return CheckedRun(tuple(axes), tuple(notes))
+    limits = {each.axis: each.config.command_limits() for each in loaded}
+    return CheckedRun(tuple(axes), (*notes, *apart_notes(loaded[0].config.apart, limits)))
 
 
 def _joint_problems(loaded: Sequence[LoadedExperiment]) -> Iterator[ConfigProblem]:

@@ -39,14 +39,14 @@ from hilctl.base.files import exists, make_folder
 from hilctl.base.yaml import texts_of
 from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
 from hilctl.experiment.device_state import heat_after, heat_before
-from hilctl.experiment.load import LoadedExperiment, load_experiment
+from hilctl.experiment.load import LoadedExperiment, load_axes
 from hilctl.experiment.preflight import check
 from hilctl.experiment.state_files import MachineTime
 from hilctl.lab.studies.study_folder import completed_runs, last_started
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.recording.run_summary import read_ends
-from hilctl.run.result import RunResult
+from hilctl.run.result import RunResult, recordings_of
 from hilctl.run.start import RunKey, completed_key, paced, unpaced, unused
 
 _log = logging.getLogger(__name__)
@@ -67,15 +67,15 @@ class StudyStep:
     Attributes:
         experiment: Experiment file (YAML).
         settings: Overrides of the experiment.
-        name: Name of the recording without suffix; default: name of the experiment, and number of
-            the step.
+        name: Name of the recording without suffix, before the name of its axis; default: name of
+            the experiment, and number of the step.
         text: Description for progress and messages; default: the name.
         replaces: Replace a recording of the same name; otherwise the new one gets a number.
         repeats: Largest number of repeats after a stall of the computer, the network or the device.
         flaw: Returns why a completed recording is unusable, as after a stall, or an empty text.
         cool_to_rms_a: Running rms of the current to cool to; by default, only as far as the run
             needs to keep its budget.
-        loaded: The loaded experiment, if it is known.
+        loaded: The loaded experiment of each axis, if it is known.
         heat: Effect of the run on the heat of the coil, if it is known.
         done_s: Planned time of the steps before it, for progress.
     """
@@ -88,7 +88,7 @@ class StudyStep:
     repeats: int = REPEATS
     flaw: Callable[[Recording], str] | None = None
     cool_to_rms_a: float = math.inf
-    loaded: LoadedExperiment | None = None
+    loaded: tuple[LoadedExperiment, ...] = ()
     heat: RunHeat | None = None
     done_s: float = 0.0
 
@@ -98,18 +98,35 @@ class StudyRun:
     """A completed run.
 
     Attributes:
-        path: Its recording.
+        paths: Recordings of its axes, that of the first one first.
         kept: Whether an earlier call of the study has recorded it.
     """
 
     step: StudyStep
-    path: Path
+    paths: tuple[Path, ...]
     kept: bool = False
 
+    @property
+    def path(self) -> Path:
+        """Its recording; that of the first axis if there are several."""
+        return self.paths[0]
+
     @cached_property
+    def recordings(self) -> tuple[Recording, ...]:
+        """The complete recordings of its axes."""
+        return tuple(map(read, self.paths))
+
+    @property
     def recording(self) -> Recording:
-        """Its complete recording."""
-        return read(self.path)
+        """Its complete recording; that of the first axis if there are several."""
+        return self.recordings[0]
+
+    @property
+    def flaw(self) -> str:
+        """Why a recording is unusable; empty if all are usable."""
+        if self.step.flaw is None:
+            return ""
+        return next(filter(None, map(self.step.flaw, self.recordings)), "")
 
 
 _T = TypeVar("_T")
@@ -230,7 +247,7 @@ class _Engine:
     ) -> None:
         self._folder, self._host, self._resume, self._total_s = folder, host, resume, total_s
         self._completed = completed_runs(folder) if resume else {}
-        self._last: Path | None = None
+        self._last: Sequence[Path | None] = ()
         self._count = 0
         self.moved, self.text = False, ""
 
@@ -238,77 +255,90 @@ class _Engine:
         """Return the run of a step, recorded now unless it was recorded earlier."""
         self._count += 1
         self.text = step.text or step.name or f"step {self._count}"
-        loaded = step.loaded or load_experiment(Path(step.experiment), texts_of(step.settings))
-        file = self._folder / f"{step.name or f'{loaded.config.name}-{self._count:04d}'}.mcap"
-        key = RunKey.of(loaded)
-        kept = self._kept(step, key, file) if self._resume else None
+        loaded = step.loaded or load_axes(Path(step.experiment), texts_of(step.settings))
+        name = step.name or f"{loaded[0].config.name}-{self._count:04d}"
+        file = self._folder / f"{name}.mcap"
+        keys = {each.axis: RunKey.of(each) for each in loaded}
+        kept = self._kept(step, keys, file) if self._resume else None
         if kept is not None:
             return kept
         for number in range(1, step.repeats + 1):
             try:
-                return self._recorded(step, loaded, key, file)
+                return self._recorded(step, loaded, keys, file)
             except StepFaultError as error:
                 if not error.stalled:
                     raise
                 _log.warning("%s; the run is repeated (%d of %d)", error, number, step.repeats)
-        return self._recorded(step, loaded, key, file)
+        return self._recorded(step, loaded, keys, file)
 
     def interrupted(self) -> StepStoppedError:
         """Return the error for Ctrl-C while no run is active."""
         return StepStoppedError(f"{self.text}: stopped by Ctrl-C", signal.SIGINT)
 
-    def _kept(self, step: StudyStep, key: RunKey, file: Path) -> StudyRun | None:
+    def _kept(self, step: StudyStep, keys: Mapping[str, RunKey], file: Path) -> StudyRun | None:
         """Return an earlier run of a step, which counts once; None without one."""
+        first, key = next(iter(keys.items()))
         recorded = self._completed.get(key, [])
         while recorded:
-            run = StudyRun(step, recorded.pop(0), kept=True)
-            if step.flaw is None or not step.flaw(run.recording):
+            path = recorded.pop(0)
+            whole = path.with_stem(path.stem.removesuffix(f".{first}")) if first else path
+            paths = recordings_of([*keys], whole)
+            run = StudyRun(step, tuple(paths.values()), kept=True)
+            if all(completed_key(paths[axis]) == keys[axis] for axis in keys) and not run.flaw:
                 return run
         # Once a step has run again, its results may change the steps after it.
-        if step.replaces and not self.moved and completed_key(file) not in {None, key}:
+        there = recordings_of([first], file)[first]
+        if step.replaces and not self.moved and completed_key(there) not in {None, key}:
             raise InputError(
-                f"{file} was recorded with other settings: restore them, choose another --folder, "
+                f"{there} was recorded with other settings: restore them, choose another --folder, "
                 "or replace all recordings with --overwrite"
             )
         return None
 
     def _recorded(
-        self, step: StudyStep, loaded: LoadedExperiment, key: RunKey, file: Path
+        self,
+        step: StudyStep,
+        loaded: Sequence[LoadedExperiment],
+        keys: Mapping[str, RunKey],
+        file: Path,
     ) -> StudyRun:
         """Run a step when the coil is cool enough."""
         heat_a2 = self._cool(step, loaded) if self._host.real_time else 0.0
         self._show(step, self.text)
         result = self._host.run(
             Path(step.experiment), texts_of(step.settings),
-            file if step.replaces else unused(file, "-"),
+            file if step.replaces else unused(file, "-", [*keys]),
             lambda part: self._show(step, self.text, part),
             overwrite=step.replaces, heat_a2=heat_a2,
         )  # fmt: skip
-        self.moved, self._last = True, result.path
+        self.moved, self._last = True, result.recordings
         reason = f"{self.text}: {result.reason}"
         if result.stop_signal:
             raise StepStoppedError(reason, result.stop_signal, result)
         if result.code != "completed":
-            raise _fault(reason, result, loaded.config.safe.at_start)
-        if RunKey.of_facts(read_ends(result.path).run) != key:
+            reads = all(each.config.safe.at_start is None for each in loaded)
+            raise _fault(reason, result, reads_output=reads)
+        if [RunKey.of_facts(read_ends(path).run) for path in result.recordings] != [*keys.values()]:
             rule = "the experiment, or a file it uses, changed during the study"
             raise RunError(f"{self.text}: {rule}. Start the study again")
-        run = StudyRun(step, result.path)
-        if step.flaw is not None and (flaw := step.flaw(run.recording)):
+        run = StudyRun(step, tuple(result.recordings))
+        if flaw := run.flaw:
             raise StepFaultError(f"{self.text}: {flaw}", result, stalled=True)
         return run
 
-    def _cool(self, step: StudyStep, loaded: LoadedExperiment) -> float:
-        """Wait until the coil is cool enough; return its heat then, in A^2."""
-        now, config = self._host.now(), loaded.config
-        if config.limits.thermal_time_constant_s is None:
+    def _cool(self, step: StudyStep, loaded: Sequence[LoadedExperiment]) -> float:
+        """Wait until each coil is cool enough; return the highest heat then, in A^2."""
+        now, coils = self._host.now(), []
+        recorded = self._last or [last_started(self._folder)] * len(loaded)
+        for each, last in zip(loaded, recorded, strict=True):
+            if each.config.limits.thermal_time_constant_s is not None:
+                # Heat of the last run causes a pause, not an error.
+                heat = step.heat or check(each, heat_a2=None).forecast.heat
+                coils.append((CoolingCoil(each.rig, heat_of(each, last, now), now.boot_s), heat))
+        if not coils:
             return 0.0
-        heat_a2 = heat_of(loaded, self._last or last_started(self._folder), now)
-        # Heat of the last run causes a pause, not an error.
-        heat = step.heat or check(loaded, heat_a2=None).forecast.heat
-        coil = CoolingCoil(loaded.rig, heat_a2, now.boot_s)
-        pause_s = coil.pause_s(heat, now.boot_s, step.cool_to_rms_a)
-        heat_a2 = coil.heat_a2(now.boot_s + pause_s)
+        pause_s = max(coil.pause_s(heat, now.boot_s, step.cool_to_rms_a) for coil, heat in coils)
+        heat_a2 = max(coil.heat_a2(now.boot_s + pause_s) for coil, _ in coils)
         while pause_s > 0.0:
             self._show(step, f"{self.text}: the coil cools for {pause_s:.0f} s")
             self._host.sleep_s(min(pause_s, _WAIT_SHOWN_S))
@@ -324,14 +354,14 @@ class _Engine:
         self._host.on_progress(part, text)
 
 
-def _fault(text: str, result: RunResult, at_start: float | None) -> StepFaultError:
+def _fault(text: str, result: RunResult, *, reads_output: bool) -> StepFaultError:
     """Return the error of a run that ended by a fault."""
     events: tuple[Event, ...] = ()
     with suppress(DataError):  # no sample was recorded
         events = tuple(read(result.path).events)
     # The next run must know the output. It reads it from the device, except if at_start is set:
     # then this run must have confirmed its safe value.
-    known = result.safe or at_start is None
+    known = result.safe or reads_output
     stalled = known and not _STALLS.isdisjoint(event.code for event in events)
     return StepFaultError(text, result, events, stalled=stalled)
 

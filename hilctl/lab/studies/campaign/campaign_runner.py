@@ -135,7 +135,7 @@ class Campaign:
             text=each.step.text,
             repeats=0,  # a stall is marked, and the next call repeats the step
             cool_to_rms_a=config.cool_down.to_rms_a or math.inf,
-            loaded=each.loaded,
+            loaded=(each.loaded,),
             heat=each.heat,
             done_s=done_s,
         )

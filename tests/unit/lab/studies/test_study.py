@@ -19,6 +19,7 @@ from hilctl.lab.studies.study import (
     require_room,
     run_study,
 )
+from hilctl.run.start import unpaced
 from tests.unit.lab.studies.campaign.conftest import experiment
 from tests.unit.lab.studies.conftest import StudyRig
 
@@ -257,3 +258,52 @@ def test_disk_space_needs_a_margin(tmp_path):
     require_room(tmp_path, 10.0, 12.0)
     with pytest.raises(InputError, match="no room"):
         require_room(tmp_path, 10.0, 11.9)
+
+
+class TestAxes:
+    """A step with two axes has a recording per axis."""
+
+    AXES = ("axes={x: {device: {seed: 1}}, y: {device: {seed: 2}}}",)
+
+    @pytest.fixture
+    def host(self):
+        return StudyHost(run=unpaced, real_time=False)
+
+    def test_a_run_has_the_recording_of_each_axis(self, steps, tmp_path, host):
+        (run,) = run_study(steps(self.AXES), tmp_path, host)
+        assert [path.name for path in run.paths] == ["rig-0001.x.mcap", "rig-0001.y.mcap"]
+        assert [each.run["axis"] for each in run.recordings] == ["x", "y"]
+        assert run.path == run.recording.path == run.paths[0]
+
+    def test_a_completed_step_has_all_recordings(self, steps, tmp_path, host):
+        run_study(steps(self.AXES), tmp_path, host)
+        (kept,) = run_study(steps(self.AXES), tmp_path, host)
+        assert (kept.kept, len(kept.recordings)) == (True, 2)
+        kept.paths[1].unlink()
+        (again,) = run_study(steps(self.AXES), tmp_path, host)
+        assert (again.kept, again.path.name) == (False, "rig-0001-2.x.mcap")
+
+    def test_a_step_with_other_settings_of_one_axis_is_run(self, steps, tmp_path, host):
+        run_study(steps(self.AXES), tmp_path, host)
+        other = [*self.AXES, "axes.y.device.seed=3"]
+        (run,) = run_study(steps(other), tmp_path, host)
+        assert not run.kept
+
+    def test_the_flaw_of_one_axis_repeats_the_run(self, steps, tmp_path, host):
+        flaws = iter(["", "wrong"])
+        (run,) = run_study(steps(self.AXES, flaw=lambda recording: next(flaws, "")), tmp_path, host)
+        assert run.path.name == "rig-0001-2.x.mcap"
+
+    def test_the_hottest_coil_is_waited_for(self, steps, tmp_path):
+        budget = [f"{key}={value}" for key, value in BUDGET.items()]
+        hot = [*self.AXES, *budget, "axes.x.waveform={amplitude: 0.2}"]
+
+        def paused_s(*settings):
+            rig, folder = Rig(), tmp_path / f"{len(settings)}{settings[-1]}"
+            host = replace(rig.host, run=unpaced)
+            run_study(steps([*hot, *settings], [*hot, *settings]), folder, host)
+            return sum(rig.pauses)
+
+        x_s, y_s, both_s = map(paused_s, ("axis=x", "axis=y", "name=rig"))
+        assert x_s < 0.5 * y_s
+        assert both_s == pytest.approx(y_s, rel=0.1)
