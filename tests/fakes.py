@@ -217,7 +217,7 @@ class FakeHost:
     ):
         self.clock, self._shape = clock, (block, state_size)
         self.lanes = [self]
-        self.full, self.stop, self.tunings = full, stop, tunings or {}
+        self.full, self.stop, self.requested = full, stop, tunings or {}
         self.heads, self.columns, self.flags, self.states = [], [], [], []
         self.events, self.heartbeats, self.safe_writes = [], [], []
         self.sent = []  # first sample and commands of each pending block
@@ -250,8 +250,9 @@ class FakeHost:
     def closing(self):
         self.closed = True
 
-    def tuning(self):
-        return self.tunings.pop(self.heartbeats[-1], None)
+    def tunings(self):
+        tuning = self.requested.pop(self.heartbeats[-1], None)
+        return [] if tuning is None else [(0, tuning)]
 
     def record_event(self, event):
         self.events.append(event)

@@ -4,7 +4,7 @@ The protocol is described in ``docs/reference/protocol.md``.
 """
 
 import time
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from typing import TYPE_CHECKING, Any
 
 from hilctl.base.errors import InputError, RunError
@@ -64,9 +64,10 @@ class RunConnection:
         gain: float | None = None,
         offset: float | None = None,
         inverse: InverseState | None = None,
+        axes: Mapping[str, Mapping[str, Any]] | None = None,
         over_s: float = 1.0,
     ) -> dict[str, Any]:
-        """Change the reference or the inverse by a ramp; values of None are kept.
+        """Change the reference or the inverse of all axes by a ramp; values of None are kept.
 
         Return when the change is accepted; ``begins_at_sample`` is its first sample.
 
@@ -75,13 +76,16 @@ class RunConnection:
             offset: Offset of the reference, in the waveform's unit.
             inverse: ``out`` replaces the inverse by a linear gain of the same stroke, ``in``
                 enables it again.
+            axes: Values of single axes by name, ``{"x": {"gain": 0.5}}``; they come first.
             over_s: Duration of the change.
 
         Raises:
             InputError: The change is rejected; nothing has changed.
             RunError: The run does not answer.
         """
-        return set_run(self._folder, gain=gain, offset=offset, inverse=inverse, over_s=over_s)
+        return set_run(
+            self._folder, gain=gain, offset=offset, inverse=inverse, axes=axes, over_s=over_s
+        )
 
     def mark(self, text: str) -> dict[str, Any]:
         """Add a mark at the current sample and return that sample.

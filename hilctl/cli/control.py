@@ -48,7 +48,8 @@ def set_(
         list[str],
         typer.Argument(
             metavar="KEY=VALUE",
-            help="gain=NUMBER, offset=NUMBER (gain * reference + offset), inverse=in|out.",
+            help="gain=NUMBER, offset=NUMBER (gain * reference + offset), inverse=in|out; of one "
+            "axis x.gain=NUMBER.",
         ),
     ],
     over: Annotated[float, typer.Option(metavar="S", help="Duration of the change, s.")] = 1.0,
@@ -110,9 +111,11 @@ def _status_lines(run: dict[str, Any]) -> dict[str, str]:
         lines["time"] = f"{at_s:.1f} of {total_s:.1f} s"
         lines["samples"] = counts
         lines["late ticks"] = f"{run['late_ticks']:,}"
-        lines["reference"] = f"gain {run['gain']:g}, offset {run['offset']:g}"
-        if inverse := run["inverse"]:
-            lines["inverse"] = inverse
+        for axis, each in run.get("references", {"": run}).items():
+            name = axis and f" {axis}"
+            lines[f"reference{name}"] = f"gain {each['gain']:g}, offset {each['offset']:g}"
+            if each["inverse"]:
+                lines[f"inverse{name}"] = each["inverse"]
     axes = {f"axis {name}": path for name, path in run.get("axes", {}).items()}
     lines |= axes or {"recording": run["recording"]}
     if error := run.get("recording_error") or run.get("error"):
@@ -121,10 +124,11 @@ def _status_lines(run: dict[str, Any]) -> dict[str, str]:
 
 
 def print_change(name: str, answer: dict[str, Any]) -> None:
-    """Print the reference and inverse after a change."""
-    inverse = f", inverse {answer['inverse']}" if answer["inverse"] else ""
-    values = f"gain {answer['gain']:g}, offset {answer['offset']:g}{inverse}"
-    print(f"{name}: {values}, over {answer['over_s']:g} s")
+    """Print the reference and inverse of each axis after a change."""
+    for axis, each in answer.get("references", {"": answer}).items():
+        inverse = f", inverse {each['inverse']}" if each["inverse"] else ""
+        values = f"gain {each['gain']:g}, offset {each['offset']:g}{inverse}"
+        print(f"{name}{axis and f' {axis}'}: {values}, over {answer['over_s']:g} s")
 
 
 def print_stopped(stopped: Sequence[dict[str, Any]], wait_s: float) -> None:

@@ -140,13 +140,13 @@ class RunReader:
         """State of the inverse after the last change, ``in`` or ``out``; None without one."""
         if not self.description.compensator:
             return None
-        changed = self._page.get(PageField.TUNE_WANTED)
+        changed = self._page.get(PageField.TUNE_NUMBER)
         return "out" if changed and not self._page.get_float(PageField.TUNE_INVERSE_SHARE) else "in"
 
     def status(self) -> dict[str, Any]:
         """Return everything except the traces, as plain values for JSON."""
         page, rate_hz = self._page, self.description.sample_rate_hz
-        outcome, tuned = page.outcome(), page.get(PageField.TUNE_WANTED)
+        outcome, tuned = page.outcome(), page.get(PageField.TUNE_NUMBER)
         late = self._lateness.percentiles_us()
         killed = "no outcome from the loop: see the report" if self.ended else ""
         ring_used = (page.get(PageField.HEAD) - page.get(PageField.TAIL)) / self._ring.slots

@@ -265,9 +265,9 @@ class Loop:
             self._begin_safe_ramp("fault", "late", late)
         elif stop:
             self._begin_safe_ramp("stopped", "stopped", stop)
-        elif self._phase is _FOLLOWING and (tuning := self._host.tuning()):
-            for chain in self._chains:
-                chain.tune(tuning, self._next_sample)
+        elif self._phase is _FOLLOWING:
+            for axis, tuning in self._host.tunings():
+                self._chains[axis].tune(tuning, self._next_sample)
 
     def _fill(self) -> bool:
         """Compute the commands of a tick; return whether the safe ramp ends in it."""

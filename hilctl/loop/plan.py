@@ -1,6 +1,6 @@
 """Plan of a run, and interface of the host that a loop runs in."""
 
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass, field
 from typing import Protocol
 
@@ -136,6 +136,9 @@ class Host(Protocol):
         """Publish that the loop has ended; closing the device may take as long as its timeouts."""
         ...
 
-    def tuning(self) -> Tuning | None:
-        """Return a requested change that begins now; each change is returned once."""
+    def tunings(self) -> Iterable[tuple[int, Tuning]]:
+        """Return the number of each axis with a requested change that begins now, and the change.
+
+        Each change is returned once.
+        """
         ...

@@ -35,14 +35,12 @@ class Tuning:
 
     Attributes:
         samples: Duration of the change.
-        begins_at: First sample of the change; the next block if it is in the past.
         inverse_share: Share of the inverse in the command, 0 to 1; the line has the rest.
     """
 
     gain: float
     offset: float
     samples: int
-    begins_at: int = 0
     inverse_share: float = 1.0
     line: LinearBypass = LinearBypass()
 

@@ -9,7 +9,7 @@ import os
 import signal
 import sys
 import time
-from collections.abc import Collection, Sequence
+from collections.abc import Collection, Iterable, Sequence
 from contextlib import ExitStack
 from dataclasses import replace
 from pathlib import Path
@@ -74,7 +74,8 @@ class RingHost:
     ) -> None:
         self.clock = clock
         self.lanes = [RingLane(each) for each in rings]
-        self._page = rings[0].page
+        self._pages = [each.page for each in rings]
+        self._page = self._pages[0]
         self._numbers = self._page.numbers
         self._supervisor = supervisor
         self._silence_ns = silence_s * 1e9
@@ -109,31 +110,38 @@ class RingHost:
         self._numbers[_HEARTBEAT_NS] = self.clock.now_ns()
         self._page.publish(PageField.PHASE, Phase.CLOSING)
 
-    def tuning(self) -> Tuning | None:
-        """Return a new requested change that is due, or None."""
+    def tunings(self) -> Iterable[tuple[int, Tuning]]:
+        """Return the axes with a new requested change that is due, and their changes."""
         numbers, page = self._numbers, self._page
         if numbers[_TUNE_WANTED] == numbers[_TUNE_TAKEN]:
-            return None
+            return ()
         wanted = page.observe(PageField.TUNE_WANTED)
         if numbers[_NEXT_SAMPLE] < numbers[_TUNE_BEGINS_AT]:
-            return None
-        tuning = Tuning(
-            page.get_float(PageField.TUNE_GAIN),
-            page.get_float(PageField.TUNE_OFFSET),
-            page.get(PageField.TUNE_SAMPLES),
-            page.get(PageField.TUNE_BEGINS_AT),
-            page.get_float(PageField.TUNE_INVERSE_SHARE),
-            LinearBypass(
-                *map(page.get_float, (PageField.TUNE_LINE_SLOPE, PageField.TUNE_LINE_AT_ZERO))
-            ),
-        )
-        # After reading it: from now on the supervisor may write the next one.
+            return ()
+        tunings = [
+            (axis, _tuning(each))
+            for axis, each in enumerate(self._pages)
+            if each.get(PageField.TUNE_NUMBER) == wanted
+        ]
+        # After reading them: from now on the supervisor may write the next ones.
         page.publish(PageField.TUNE_TAKEN, wanted)
-        return tuning
+        return tunings
 
     def supervised(self) -> bool:
         """Return whether the supervisor is alive."""
         return os.getppid() == self._supervisor
+
+
+def _tuning(page: SharedPage) -> Tuning:
+    """Return the change on the page of an axis."""
+    line = map(page.get_float, (PageField.TUNE_LINE_SLOPE, PageField.TUNE_LINE_AT_ZERO))
+    return Tuning(
+        page.get_float(PageField.TUNE_GAIN),
+        page.get_float(PageField.TUNE_OFFSET),
+        page.get(PageField.TUNE_SAMPLES),
+        page.get_float(PageField.TUNE_INVERSE_SHARE),
+        LinearBypass(*line),
+    )
 
 
 def loaded_of(axis: AxisJob) -> LoadedExperiment:

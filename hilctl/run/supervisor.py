@@ -288,9 +288,10 @@ class Supervisor:
                     run_folder(config.name, self._recordings, time.time(), holds)
                 )
                 rings = self._make_rings(folder)
-                page = rings[0].page
+                pages = [each.page for each in rings]
+                page = pages[0]
                 recording = RingRecorder(rings, recorders, config.recording.flush_s)
-                requests = Requests(self._checked, folder, page, recording)
+                requests = Requests(self._checked, folder, pages, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 self._write_job(folder, locks.descriptors)
                 # Kept open: watchers find it even if the folder is removed.

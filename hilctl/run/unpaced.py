@@ -151,9 +151,9 @@ class OfflineHost:
     def closing(self) -> None:
         """Do nothing: there is no supervisor."""
 
-    def tuning(self) -> Tuning | None:
-        """Return None: no change is requested."""
-        return None
+    def tunings(self) -> Iterable[tuple[int, Tuning]]:
+        """Return nothing: no change is requested."""
+        return ()
 
 
 def run_unpaced(run: CheckedRun, output: Path, *, overwrite: bool = False) -> RunResult:

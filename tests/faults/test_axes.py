@@ -102,12 +102,23 @@ def test_status_marks_and_stop(begun):
         name: str(path) for name, path in zip("xy", begun.outputs, strict=True)
     }
     assert (status["state"], status["missing_samples"]) == ("running", 0)
-    with pytest.raises(InputError, match="x and y"):
-        set_run(run, gain=0.5)
+    both = set_run(run, gain=0.5, over_s=0.1)
+    assert both["references"]["y"]["gain"] == 0.5
+    alone = set_run(run, axes={"y": {"gain": 0.25}}, over_s=0.1)
+    with pytest.raises(InputError, match="'z'"):
+        set_run(run, axes={"z": {"gain": 1.0}})
+    gains = [each["gain"] for each in status_of(run)["references"].values()]
+    assert gains == [0.5, 0.25]
+    while status_of(run)["sample"] <= alone["begins_at_sample"]:
+        time.sleep(0.01)
     mark_run(run, "tapped")
     (stopped,) = stop_runs([run], 60.0)
     assert stopped["ended"]
     begun.ended()
-    for path in begun.outputs:
-        assert "mark" in {event.code for event in read(path).events}
+    x, y = ([*read(path).events] for path in begun.outputs)
+    assert "mark" in {event.code for event in x} & {event.code for event in y}
+    at_x, at_y = ([each.sample for each in events if each.code == "tuned"] for events in (x, y))
+    assert at_y == [*at_x, at_y[1]]
+    assert at_y[0] >= both["begins_at_sample"]
+    assert at_y[1] >= alone["begins_at_sample"]
     assert_complete(begun, "stopped")

@@ -1,5 +1,6 @@
 """The inverse bypassed and enabled during a run, at full stroke and 100 Hz, on a simulated rig."""
 
+from collections.abc import Mapping
 from dataclasses import replace
 from pathlib import Path
 
@@ -24,14 +25,14 @@ OUT_S, IN_S, FADE_S = 1.0, 2.0, 0.25
 class _Switched(unpaced.OfflineHost):
     """Bypasses and enables the inverse at given times of a run."""
 
-    changes: tuple[Tuning, ...] = ()
+    changes: Mapping[int, Tuning] = {}
 
     def heartbeat(self, next_sample, late_ticks):
         self._now = next_sample
         return super().heartbeat(next_sample, late_ticks)
 
-    def tuning(self):
-        return next((each for each in self.changes if each.begins_at == self._now), None)
+    def tunings(self):
+        return [(0, self.changes[self._now])] if self._now in self.changes else []
 
 
 @pytest.fixture(scope="module")
@@ -39,10 +40,10 @@ def switched(tmp_path_factory):
     settings = ["waveform.frequency_hz=100", "waveform.duration_s=3.0"]
     checked = checked_experiment(DEMO, settings)
     line, samples = checked.forecast.line, round(FADE_S * RATE_HZ)
-    changes = tuple(
-        Tuning(1.0, 0.0, samples, round(at_s * RATE_HZ), share, line)
+    changes = {
+        round(at_s * RATE_HZ): Tuning(1.0, 0.0, samples, share, line)
         for at_s, share in ((OUT_S, 0.0), (IN_S, 1.0))
-    )
+    }
     output = tmp_path_factory.mktemp("inverse") / "run.mcap"
     with pytest.MonkeyPatch.context() as patch:
         patch.setattr(_Switched, "changes", changes)
@@ -106,10 +107,8 @@ def test_feedback_and_adaptation_pause_while_bypassed(learns, tmp_path, monkeypa
     settings += ["waveform.frequency_hz=20", "waveform.duration_s=2.5"]
     checked = checked_experiment(DEMO, settings)
     line = checked.forecast.line
-    out, back = (
-        Tuning(1.0, 0.0, 1000, at, share, line) for at, share in ((8000, 0.0), (14000, 1.0))
-    )
-    monkeypatch.setattr(_Switched, "changes", (out, back))
+    changes = {at: Tuning(1.0, 0.0, 1000, share, line) for at, share in ((8000, 0.0), (14000, 1.0))}
+    monkeypatch.setattr(_Switched, "changes", changes)
     monkeypatch.setattr(unpaced, "OfflineHost", _Switched)
     unpaced.run_unpaced(CheckedRun((checked,)), tmp_path / "run.mcap")
     recording = read(tmp_path / "run.mcap")

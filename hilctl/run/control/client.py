@@ -240,17 +240,19 @@ def set_run(
     gain: float | None = None,
     offset: float | None = None,
     inverse: InverseState | None = None,
+    axes: Mapping[str, Mapping[str, Any]] | None = None,
     over_s: float = 1.0,
 ) -> dict[str, Any]:
     """Change gain or offset of a running reference, or bypass its inverse; None: unchanged.
 
-    The inverse ``out`` is replaced by a straight line. The change takes ``over_s``.
+    The inverse ``out`` is replaced by a straight line. The change takes ``over_s``. It is that of
+    all axes; ``axes`` has other values of axes by name. All begin with the same sample.
 
     Raises:
         InputError: The run refuses the change.
         RunError: It does not answer.
     """
-    wanted = request("set", gain=gain, offset=offset, inverse=inverse, over_s=over_s)
+    wanted = request("set", gain=gain, offset=offset, inverse=inverse, axes=axes, over_s=over_s)
     return ask(run.socket, wanted, timeout_s=_SET_S)
 
 
@@ -262,19 +264,23 @@ def mark_run(run: RunFolder, text: str) -> dict[str, Any]:
 def assigned(assignments: Sequence[str]) -> dict[str, Any]:
     """Return the arguments of :func:`set_run` from texts; raise InputError for invalid ones."""
     wanted: dict[str, Any] = {}
+    axes: dict[str, dict[str, Any]] = {}
     for text in assignments:
-        key, equals, value = text.partition("=")
+        name, equals, value = text.partition("=")
+        axis, _, key = name.rpartition(".")
         if key not in {"gain", "offset", "inverse"} or not equals:
-            raise InputError(f"must be gain=NUMBER, offset=NUMBER or inverse=in|out: {text!r}")
-        if key in wanted:
-            raise InputError(f"{key} is given twice: {text!r}")
+            rule = f"must be gain=NUMBER, offset=NUMBER or inverse=in|out: {text!r}"
+            raise InputError(f"{rule} (of one axis: x.gain=NUMBER)")
+        values = axes.setdefault(axis, {}) if axis else wanted
+        if key in values:
+            raise InputError(f"{name} is given twice: {text!r}")
         if key == "inverse" and value not in {"in", "out"}:
-            raise InputError(f"inverse must be in or out: {value!r}")
+            raise InputError(f"{name} must be in or out: {value!r}")
         try:
-            wanted[key] = value if key == "inverse" else float(value.replace("_", " "))
+            values[key] = value if key == "inverse" else float(value.replace("_", " "))
         except ValueError:
-            raise InputError(f"{key} must be a number: {value!r}") from None
-    return wanted
+            raise InputError(f"{name} must be a number: {value!r}") from None
+    return wanted | {"axes": axes} if axes else wanted
 
 
 def finish_dead_runs() -> None:

@@ -14,9 +14,9 @@ import os
 import socketserver
 import threading
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Mapping, Sequence
 from contextlib import suppress
-from dataclasses import replace
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Annotated, Any, Literal, Self
 
@@ -26,6 +26,7 @@ from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 from hilctl.base.axes import names_text
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import MARK, Event
+from hilctl.base.formatting import did_you_mean
 from hilctl.base.private_dirs import private_folder
 from hilctl.base.strict import HALF_CHARACTER, StrictModel, first_problem, without_halves
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
@@ -170,44 +171,64 @@ class _Handler(socketserver.BaseRequestHandler):
         return json.dumps({VERSION_KEY: VERSION, **answer}).encode() + b"\n"
 
 
-_SHARES: dict[str | None, float] = {"in": 1.0, "out": 0.0}
 _MOST_WAITING = 16
 _WAIT_S = 20.0  # longest wait for the previous change; a client waits longer for its answer
 _POLL_S = 0.005
 _LEAD_S = 0.05  # time from the answer to the first sample of a change
 _ROUNDING = 1e-9  # relative; a run at its slew limit still accepts an offset
+_COUPLING = "coupling"  # key of an experiment whose axes are decoupled before the run
+_TOGETHER = "the axes are decoupled for equal changes: change all of them, without a name"
+_ONE_AXIS = "the run has one axis: change it without the name {!r}"
 _CYCLE = 2000  # samples per cycle of the sine from which the command range is computed
 
 
+@dataclass(frozen=True, slots=True)
+class ReferenceState:
+    """Gain, offset and inverse of an axis after its last change; None without an inverse."""
+
+    gain: float
+    offset: float
+    inverse: InverseState | None
+
+    @property
+    def inverse_share(self) -> float:
+        """Share of the inverse in the command; the line has the rest."""
+        return 0.0 if self.inverse == "out" else 1.0
+
+
 class Changes:
-    """Changes of one run, requested from several threads; gain and offset are final values."""
+    """Changes of one run, requested from several threads.
+
+    Args:
+        run: The run.
+        pages: The page of each axis; that of the first one is the page of the run.
+    """
 
     def __init__(
         self,
-        checked: CheckedExperiment,
-        page: SharedPage,
+        run: CheckedRun,
+        pages: Sequence[SharedPage],
         clock: Callable[[], float] = time.monotonic,
         sleep: Callable[[float], None] = time.sleep,
     ) -> None:
-        self.gain, self.offset, self._inverse_share = 1.0, 0.0, 1.0
-        self._checked, self._page = checked, page
+        self._axes = dict(zip(run.names, zip(run.axes, pages, strict=True), strict=True))
+        self._states = {
+            name: ReferenceState(1.0, 0.0, "in" if each.loaded.model else None)
+            for name, (each, _) in self._axes.items()
+        }
+        self._run, self._page = run, pages[0]
         self._clock, self._sleep = clock, sleep
         self._lock = threading.Lock()
         self._places = threading.BoundedSemaphore(_MOST_WAITING)
 
-    @property
-    def inverse(self) -> str | None:
-        """Final state of the inverse, ``in`` or ``out``; None without an inverse."""
-        if self._checked.loaded.model is None:
-            return None
-        return "in" if self._inverse_share else "out"
+    def references(self) -> dict[str, Any]:
+        """Return the final values of the only axis, or those of all axes under ``references``."""
+        values = {name: asdict(state) for name, state in self._states.items()}
+        return values.get("", {"references": values})
 
     def make(self, wanted: "SetRequest") -> dict[str, Any]:
         """Make a change when the loop has taken the previous one."""
-        if wanted.gain is None and wanted.offset is None and wanted.inverse is None:
-            raise InputError("set: gain, offset or inverse is required")
-        if wanted.inverse is not None and (why := fade_refusal(self._checked, wanted.inverse)):
-            raise InputError(f"set: inverse: {why}")
+        changes = self._changes_of(wanted)
         if not self._places.acquire(blocking=False):
             raise InputError(f"set: {_MOST_WAITING} changes are waiting already: try again")
         try:
@@ -219,7 +240,7 @@ class Changes:
                     # The loop must have taken the previous change, which is overwritten.
                     page = self._page
                     if page.get(PageField.TUNE_WANTED) == page.observe(PageField.TUNE_TAKEN):
-                        return self._make(wanted)
+                        return self._make(changes, wanted.over_s)
                 if self._clock() >= until:
                     raise InputError("set: the loop has not taken the previous change: try again")
                 self._sleep(_POLL_S)
@@ -230,54 +251,83 @@ class Changes:
         """Return why no change is possible, or an empty text."""
         if self._page.get(PageField.STOP):
             return "the run is in its safe ramp"
-        if self._page.get(PageField.NEXT_SAMPLE) >= self._checked.forecast.samples:
+        if self._page.get(PageField.NEXT_SAMPLE) >= self._run.first.forecast.samples:
             return "the waveform has ended; the run is in its safe ramp"
         return ""
 
-    def _make(self, wanted: "SetRequest") -> dict[str, Any]:
-        """Write a change to the page; return the answer."""
-        gain = self.gain if wanted.gain is None else wanted.gain
-        offset = self.offset if wanted.offset is None else wanted.offset
-        share = _SHARES.get(wanted.inverse, self._inverse_share)
-        bypassed = min(share, self._inverse_share) < 1.0
-        if why := bound_refusal(self._checked, gain, offset, bypassed=bypassed):
-            raise InputError(f"set: {why}")
-        page, config = self._page, self._checked.loaded.config
+    def _changes_of(self, wanted: "SetRequest") -> dict[str, dict[str, Any]]:
+        """Return the new values of each axis that changes; raise InputError if it cannot."""
+        names = [*self._axes]
+        if unknown := [name for name in wanted.axes if name not in names]:
+            known = f"no axis is named {unknown[0]!r} ({did_you_mean(unknown[0], names)})"
+            raise InputError(f"set: {known if names[0] else _ONE_AXIS.format(unknown[0])}")
+        if wanted.axes and _COUPLING in self._run.first.loaded.document.data:
+            raise InputError(f"set: {_COUPLING}: {_TOGETHER}")
+        common = wanted.model_dump(include={*ReferenceChange.model_fields}, exclude_none=True)
+        own = {name: each.model_dump(exclude_none=True) for name, each in wanted.axes.items()}
+        changes = {name: common | own.get(name, {}) for name in names}
+        changes = {name: values for name, values in changes.items() if values}
+        if not changes:
+            raise InputError("set: gain, offset or inverse is required")
+        _refuse(
+            {
+                name: fade_refusal(self._axes[name][0], values["inverse"])
+                for name, values in changes.items()
+                if "inverse" in values
+            }
+        )
+        return changes
+
+    def _make(self, changes: Mapping[str, Mapping[str, Any]], over_s: float) -> dict[str, Any]:
+        """Write the changes of some axes to their pages; return the answer."""
+        states = {name: replace(self._states[name], **each) for name, each in changes.items()}
+        _refuse({name: self._bound_refusal(name, state) for name, state in states.items()})
+        page, config = self._page, self._run.config
         lead = max(1, round(_LEAD_S * config.sample_rate_hz))
         blocks = math.ceil((page.get(PageField.NEXT_SAMPLE) + lead) / config.block) + 1
         begins_at = blocks * config.block
-        if begins_at >= self._checked.forecast.samples:
+        if begins_at >= self._run.first.forecast.samples:
             raise InputError("set: the waveform ends before the change could begin")
-        page.put_float(PageField.TUNE_GAIN, gain)
-        page.put_float(PageField.TUNE_OFFSET, offset)
-        page.put_float(PageField.TUNE_INVERSE_SHARE, share)
-        if line := self._checked.forecast.line:
-            page.put_float(PageField.TUNE_LINE_SLOPE, line.slope)
-            page.put_float(PageField.TUNE_LINE_AT_ZERO, line.at_zero)
-        page.put(PageField.TUNE_SAMPLES, max(1, round(wanted.over_s * config.sample_rate_hz)))
+        number = page.get(PageField.TUNE_WANTED) + 1
+        for name, state in states.items():
+            checked, own = self._axes[name]
+            own.put_float(PageField.TUNE_GAIN, state.gain)
+            own.put_float(PageField.TUNE_OFFSET, state.offset)
+            own.put_float(PageField.TUNE_INVERSE_SHARE, state.inverse_share)
+            if line := checked.forecast.line:
+                own.put_float(PageField.TUNE_LINE_SLOPE, line.slope)
+                own.put_float(PageField.TUNE_LINE_AT_ZERO, line.at_zero)
+            own.put(PageField.TUNE_SAMPLES, max(1, round(over_s * config.sample_rate_hz)))
+            own.put(PageField.TUNE_NUMBER, number)
         page.put(PageField.TUNE_BEGINS_AT, begins_at)
-        # Last: the loop reads the numbers above when the count changes.
-        page.publish(PageField.TUNE_WANTED, page.get(PageField.TUNE_WANTED) + 1)
-        self.gain, self.offset, self._inverse_share = gain, offset, share
-        return {
-            "gain": gain,
-            "offset": offset,
-            "inverse": self.inverse,
-            "over_s": wanted.over_s,
-            "begins_at_sample": begins_at,
-        }
+        # Last, and once for all axes: the loop reads the numbers above when the count changes.
+        page.publish(PageField.TUNE_WANTED, number)
+        self._states |= states
+        return {**self.references(), "over_s": over_s, "begins_at_sample": begins_at}
+
+    def _bound_refusal(self, name: str, state: ReferenceState) -> str:
+        """Return why the reference of an axis cannot change to a state, or an empty text."""
+        bypassed = min(state.inverse_share, self._states[name].inverse_share) < 1.0
+        return bound_refusal(self._axes[name][0], state.gain, state.offset, bypassed=bypassed)
+
+
+def _refuse(reasons: Mapping[str, str]) -> None:
+    """Raise InputError with the reasons of all axes by name, if there are some."""
+    found = [f"{name}: {why}" if name else why for name, why in reasons.items() if why]
+    if found:
+        raise InputError(f"set: {'; '.join(found)}")
 
 
 def fade_refusal(checked: CheckedExperiment, wanted: str) -> str:
     """Return why the inverse cannot be bypassed (``out``) or enabled (``in``), or an empty text."""
     if checked.loaded.model is None:
-        return "the experiment has no compensator: there is no inverse to bypass"
+        return "inverse: the experiment has no compensator, so there is no inverse to bypass"
     if checked.forecast.line is None:
-        return "the reference is constant: there is no line through its ends"
+        return "inverse: the reference is constant: there is no line through its ends"
     if wanted == "out" and checked.loaded.config.limits.tracking_error_um is not None:
         return (
-            "limits.tracking_error_um would end the run, because the displacement leaves its "
-            "reference without the inverse: remove that limit from the experiment first"
+            "inverse: limits.tracking_error_um would end the run, because the displacement leaves "
+            "its reference without the inverse: remove that limit from the experiment first"
         )
     return ""
 
@@ -371,13 +421,19 @@ class StatusRequest(StrictModel):
     command: Literal["status"]
 
 
-class SetRequest(StrictModel):
+class ReferenceChange(StrictModel):
     """Ramp gain or offset, or replace the inverse by a line (``out``); None: unchanged."""
 
-    command: Literal["set"]
     gain: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
     offset: Annotated[float, Field(ge=-1e6, le=1e6)] | None = None
     inverse: InverseState | None = None
+
+
+class SetRequest(ReferenceChange):
+    """A change of all axes, and of some by name, whose own values come first."""
+
+    command: Literal["set"]
+    axes: dict[str, ReferenceChange] = Field(default_factory=dict)
     over_s: Annotated[float, Field(gt=0.0, le=3600.0)] = 1.0
 
 
@@ -407,14 +463,14 @@ class Requests:
         self,
         run: CheckedRun,
         folder: RunFolder,
-        page: SharedPage,
+        pages: Sequence[SharedPage],
         recording: RingRecorder,
     ) -> None:
         self._run = run
         self._folder = folder
-        self._page = page
+        self._page = pages[0]
         self._recording = recording
-        self._changes = Changes(run.first, page)
+        self._changes = Changes(run, pages)
 
     def answer(self, line: bytes) -> Mapping[str, Any]:
         """Answer one line of JSON, from any thread; a change waits for the previous one."""
@@ -429,11 +485,6 @@ class Requests:
             return self._status()
         if isinstance(request, MarkRequest):
             return self._mark(request.text)
-        if len(self._run.axes) > 1:
-            raise InputError(
-                f"set: a run of several axes ({names_text(self._run.names)}) keeps "
-                "its references: gain, offset and inverse are for one axis"
-            )
         return self._changes.make(request)
 
     def _mark(self, text: str) -> dict[str, Any]:
@@ -455,9 +506,7 @@ class Requests:
             "recorded_samples": self._recording.recorders[0].samples,
             "missing_samples": sum(each.missing for each in self._recording.recorders),
             "late_ticks": page.get(PageField.LATE_TICKS),
-            "gain": self._changes.gain,
-            "offset": self._changes.offset,
-            "inverse": self._changes.inverse,
+            **self._changes.references(),
             "recording_error": self._recording.error,
             "heartbeat_age_s": (time.monotonic_ns() - page.get(PageField.LOOP_HEARTBEAT_NS)) * 1e-9,
         }

@@ -86,6 +86,7 @@ class PageField(IntEnum):
     GUARDIAN_HEARTBEAT_NS = 56
     GUARDIAN_PHASE = 57
     TUNE_BEGINS_AT = 53
+    TUNE_NUMBER = 54  # change of the run that the page of an axis holds
     TUNE_INVERSE_SHARE = 58
     TUNE_LINE_SLOPE = 59
     TUNE_LINE_AT_ZERO = 60

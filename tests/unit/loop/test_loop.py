@@ -456,7 +456,7 @@ def test_stop_in_the_ramp_after_the_waveform_changes_nothing(block):
 def test_tuning_in_the_ramp_after_the_waveform_is_not_taken():
     rig = Rig(np.full(10, 2.0), tunings={12: Tuning(0.5, 0.0, 1)})
     assert rig.run().ended_at > 12
-    assert rig.host.tunings
+    assert rig.host.requested
     assert not rig.host.events
 
 
@@ -513,7 +513,7 @@ def test_skipped_ticks_move_a_tuning_on():
 def test_enabled_inverse_has_the_memory_of_one_never_bypassed():
     reference = 10.0 * sine(400)
     line = LinearBypass(0.1, 0.25)
-    out, back = Tuning(1.0, 0.0, 20, 0, 0.0, line), Tuning(1.0, 0.0, 30, 0, 1.0, line)
+    out, back = Tuning(1.0, 0.0, 20, 0.0, line), Tuning(1.0, 0.0, 30, 1.0, line)
     rig = Rig(reference, block=10, model=terfenol_rdpi(), tunings={50: out, 200: back})
     plain = Rig(reference, block=10, model=terfenol_rdpi())
     for each in (rig, plain):
@@ -531,7 +531,7 @@ def test_enabled_inverse_has_the_memory_of_one_never_bypassed():
 
 def test_skipped_ticks_move_a_fade_on():
     reference = np.linspace(0.0, 20.0, 200)
-    out = Tuning(1.0, 0.0, 40, 0, 0.0, LinearBypass(0.1, 0.0))
+    out = Tuning(1.0, 0.0, 40, 0.0, LinearBypass(0.1, 0.0))
     rig = Rig(
         reference,
         model=terfenol_rdpi(),

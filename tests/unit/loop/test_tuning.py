@@ -79,7 +79,7 @@ def test_two_arrays_are_moved_alike():
     assert tuner.advance(1) == (2.0, 1.0, 1.0)
 
 
-FADE = Tuning(1.0, 0.0, 30, 0, 0.0, LinearBypass(0.5, -1.0))
+FADE = Tuning(1.0, 0.0, 30, 0.0, LinearBypass(0.5, -1.0))
 BACK = replace(FADE, samples=20, inverse_share=1.0)
 
 

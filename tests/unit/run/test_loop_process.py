@@ -303,7 +303,7 @@ def test_each_reason_to_end_is_reported(host, ring, clock, monkeypatch):
 
 def test_tuning_is_applied_once(host, ring):
     page = ring.page
-    assert host.tuning() is None
+    assert [*host.tunings()] == []
     for number, gain in enumerate((0.5, 0.75), start=1):
         page.put_float(PageField.TUNE_GAIN, gain)
         page.put_float(PageField.TUNE_OFFSET, -1.0)
@@ -311,9 +311,11 @@ def test_tuning_is_applied_once(host, ring):
         page.put_float(PageField.TUNE_INVERSE_SHARE, 0.25)
         page.put_float(PageField.TUNE_LINE_SLOPE, 0.1)
         page.put_float(PageField.TUNE_LINE_AT_ZERO, -2.0)
+        page.put(PageField.TUNE_NUMBER, number)
         page.put(PageField.TUNE_WANTED, number)
-        assert host.tuning() == Tuning(gain, -1.0, 40, 0, 0.25, LinearBypass(0.1, -2.0))
-        assert host.tuning() is None
+        tuning = Tuning(gain, -1.0, 40, 0.25, LinearBypass(0.1, -2.0))
+        assert [*host.tunings()] == [(0, tuning)]
+        assert [*host.tunings()] == []
         assert page.get(PageField.TUNE_TAKEN) == number
 
 
@@ -323,12 +325,13 @@ def test_a_tuning_waits_for_its_sample(host, ring):
     page.put_float(PageField.TUNE_INVERSE_SHARE, 1.0)
     page.put(PageField.TUNE_SAMPLES, 40)
     page.put(PageField.TUNE_BEGINS_AT, 60)
+    page.put(PageField.TUNE_NUMBER, 1)
     page.put(PageField.TUNE_WANTED, 1)
     host.heartbeat(59, 0)
-    assert host.tuning() is None
+    assert [*host.tunings()] == []
     assert page.get(PageField.TUNE_TAKEN) == 0
     host.heartbeat(61, 0)
-    assert host.tuning() == Tuning(0.5, 0.0, 40, 60)
+    assert [*host.tunings()] == [(0, Tuning(0.5, 0.0, 40))]
     assert page.get(PageField.TUNE_TAKEN) == 1
 
 

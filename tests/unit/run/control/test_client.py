@@ -121,10 +121,22 @@ def test_all_runs_are_stopped_before_waiting_for_one(answers, monkeypatch):
     ("gain=high", "gain must be a number: 'high'"),
     ("gain=1_0", "gain must be a number: '1_0'"),
     ("inverse=0", "inverse must be in or out: '0'"),
+    ("offset=2", "offset is given twice"),
+    ("x.rate=1", "x.gain=NUMBER"),
+    ("x.gain=high", "x.gain must be a number"),
 ])  # fmt: skip
 def test_invalid_assignments_are_refused(text, said):
     with pytest.raises(InputError, match=said):
         assigned(["offset=1", text])
+
+
+def test_assignments_of_axes_have_their_names():
+    assert assigned(["gain=1", "x.gain=0.5", "x.inverse=out", "y.offset=2"]) == {
+        "gain": 1.0,
+        "axes": {"x": {"gain": 0.5, "inverse": "out"}, "y": {"offset": 2.0}},
+    }
+    with pytest.raises(InputError, match=r"x\.gain is given twice"):
+        assigned(["x.gain=1", "gain=1", "x.gain=1"])
 
 
 def test_a_dropped_request_is_sent_again(tmp_path):

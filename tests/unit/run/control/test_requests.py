@@ -67,7 +67,7 @@ def recording():
 @pytest.fixture
 def requests(demo, page, recording, tmp_path):
     with run_folder("demo", {"": tmp_path / "a.mcap"}, 12.0) as (folder, _):
-        yield Requests(CheckedRun((demo,)), folder, page, recording)
+        yield Requests(CheckedRun((demo,)), folder, [page], recording)
 
 
 def asked(requests, **message):
@@ -209,7 +209,7 @@ def waits():
 
 @pytest.fixture
 def changes(experiment, page, waits):
-    return Changes(experiment, page, waits.clock, waits.sleep)
+    return Changes(CheckedRun((experiment,)), [page], waits.clock, waits.sleep)
 
 
 def change(changes, gain=None, offset=None, over_s=0.2, inverse=None):
@@ -237,7 +237,7 @@ def test_a_change_reaches_the_loop_whole(changes, page):
     )
     numbers = (PageField.TUNE_SAMPLES, PageField.TUNE_BEGINS_AT, PageField.TUNE_WANTED)
     assert [page.get(each) for each in numbers] == [2000, 500 + LEAD, 1]
-    assert (changes.gain, changes.offset) == (0.5, 0.0)
+    assert changes.references() == {"gain": 0.5, "offset": 0.0, "inverse": "in"}
 
 
 def test_second_change_follows_the_first(changes, page, waits):
@@ -320,17 +320,86 @@ def test_inverse_stays_bypassed_until_it_is_enabled(changes, page, experiment):
         (4000, {"gain": 0.5}, 0.0),
         (6000, {"inverse": "in"}, 1.0),
     ):
-        assert change(changes, **wanted)["inverse"] == changes.inverse == ("in" if share else "out")
+        assert change(changes, **wanted)["inverse"] == ("in" if share else "out")
         assert [page.get_float(each) for each in numbers] == [share, line.slope, line.at_zero]
         take(page, at)
 
 
 def test_bypass_without_a_compensator_is_refused(page):
-    changes = Changes(experiment_of(), page)
+    changes = Changes(CheckedRun((experiment_of(),)), [page])
     with pytest.raises(InputError, match="set: inverse: "):
         change(changes, inverse="out")
-    assert changes.inverse is None
+    assert changes.references()["inverse"] is None
     assert page.get(PageField.TUNE_WANTED) == 0
+
+
+def axes_of(*experiments):
+    """Return a run with the axes x, y ... of experiments."""
+    return CheckedRun(
+        tuple(
+            replace(each, loaded=replace(each.loaded, axis=axis))
+            for axis, each in zip("xyz", experiments, strict=False)
+        )
+    )
+
+
+@pytest.fixture
+def axes(experiment, page, waits):
+    """Changes of two axes, and their pages."""
+    run, pages = axes_of(experiment, experiment_of(peak_a=5.0)), [page, SharedPage(mmap(-1, SIZE))]
+    return Changes(run, pages, waits.clock, waits.sleep), pages
+
+
+def change_axes(changes, **values):
+    return changes.make(SetRequest.model_validate({"command": "set", **values}))
+
+
+def test_axes_change_together_by_one_count(axes, page):
+    changes, pages = axes
+    answer = change_axes(changes, gain=0.5, axes={"y": {"gain": 0.25, "offset": 1.0}})
+    assert answer["references"] == {
+        "x": {"gain": 0.5, "offset": 0.0, "inverse": "in"},
+        "y": {"gain": 0.25, "offset": 1.0, "inverse": None},
+    }
+    assert [each.get_float(PageField.TUNE_GAIN) for each in pages] == [0.5, 0.25]
+    assert [each.get(PageField.TUNE_NUMBER) for each in pages] == [1, 1]
+    assert [each.get(PageField.TUNE_WANTED) for each in pages] == [1, 0]
+    take(page, 2000)
+    change_axes(changes, axes={"y": {"gain": 1.0}})
+    assert [each.get(PageField.TUNE_NUMBER) for each in pages] == [1, 2]
+    assert page.get(PageField.TUNE_WANTED) == 2
+    assert changes.references()["references"]["x"]["gain"] == 0.5
+
+
+@pytest.mark.parametrize(("values", "said"), [
+    ({"axes": {"yy": {"gain": 1.0}}}, "'yy'.*x, y"),
+    ({"axes": {"x": {}}}, "required"),
+    ({"inverse": "out"}, "set: y: inverse: "),
+    ({"gain": 2.0}, "set: y: "),
+    ({"gain": 90.0}, "set: x: .*; y: "),
+])  # fmt: skip
+def test_a_refused_axis_keeps_all_from_changing(axes, values, said):
+    changes, pages = axes
+    before = [bytes(each.numbers) for each in pages]
+    with pytest.raises(InputError, match=said):
+        change_axes(changes, **values)
+    assert [bytes(each.numbers) for each in pages] == before
+    assert changes.references()["references"]["x"]["gain"] == 1.0
+
+
+def test_a_run_of_one_axis_has_no_name(changes):
+    with pytest.raises(InputError, match="without the name 'x'"):
+        change_axes(changes, axes={"x": {"gain": 0.5}})
+
+
+def test_coupled_axes_change_together_only(experiment, page):
+    run, pages = axes_of(experiment, experiment), [page, SharedPage(mmap(-1, SIZE))]
+    coupled = replace(run.first.loaded, document=Document("x.yaml", "coupling: a.yaml"))
+    run = replace(run, axes=(replace(run.first, loaded=coupled), *run.axes[1:]))
+    changes = Changes(run, pages)
+    with pytest.raises(InputError, match="set: coupling: "):
+        change_axes(changes, gain=0.5, axes={"x": {"gain": 0.5}})
+    assert change_axes(changes, gain=0.5)["references"]["y"]["gain"] == 0.5
 
 
 @pytest.mark.parametrize(("gain", "offset", "refused"), [
