@@ -33,7 +33,7 @@ _YEAR_NS = 366 * 86_400 * 10**9
 
 
 class Encoded(NamedTuple):
-    """One message: topic, Unix time in ns, bytes."""
+    """One message: topic without axis, Unix time in ns, bytes."""
 
     topic: str
     time_ns: int
@@ -209,10 +209,11 @@ class MessageMaker:
 
 
 class Topics:
-    """Channels of a file: adds messages to their topics and numbers them."""
+    """Channels of a file: adds messages to the topics of an axis and numbers them."""
 
-    def __init__(self, writer: Writer) -> None:
+    def __init__(self, writer: Writer, axis: str) -> None:
         self._writer = writer
+        self._names = {topic: schema.topic_of(axis, topic) for topic in schema.TOPICS}
         self._channels: dict[str, int] = {}
         self._sequence: dict[str, int] = {}
 
@@ -224,13 +225,15 @@ class Topics:
         """Register the topics of hilctl that are not in the file yet."""
         descriptors = schema.descriptor_set()
         for topic, name in schema.TOPICS.items():
-            if topic not in self._channels:
+            named = self._names[topic]
+            if named not in self._channels:
                 number = self._writer.register_schema(f"hilctl.{name}", "protobuf", descriptors)
-                self.know(topic, self._writer.register_channel(topic, "protobuf", number), 0)
+                self.know(named, self._writer.register_channel(named, "protobuf", number), 0)
 
     def add(self, message: Encoded) -> None:
         """Write one message."""
-        channel, number = self._channels[message.topic], self._sequence[message.topic]
+        name = self._names[message.topic]
+        channel, number = self._channels[name], self._sequence[name]
         time_ns = message.time_ns
         self._writer.add_message(channel, time_ns, message.data, time_ns, number)
-        self._sequence[message.topic] += 1
+        self._sequence[name] += 1

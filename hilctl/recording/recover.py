@@ -20,7 +20,7 @@ from hilctl.base.files import open_binary, reason
 from hilctl.base.private_dirs import HAS_LOCKS
 from hilctl.base.samples import LAST_SAMPLE, BlockBatch, BlockHeader
 from hilctl.recording.encoder import MessageMaker, RecordingLayout, Topics, event_message
-from hilctl.recording.metadata_keys import CHECKSUM_FACT, sealed, unsealed
+from hilctl.recording.metadata_keys import AXIS_FACT, CHECKSUM_FACT, sealed, unsealed
 from hilctl.recording.recording_files import Replacement, lock
 from hilctl.recording.recovery_scan import Damage, RecoveryScan
 from hilctl.recording.validation import MAX_UNIX_NS, MessageValidator, count_of, sound_blocks
@@ -114,7 +114,7 @@ class Rewritten:
         header = survey.scan.header
         self._survey = survey
         self._writer = mcap_writer(stream)
-        self._topics = Topics(self._writer)
+        self._topics = Topics(self._writer, survey.run.get(AXIS_FACT, ""))
         self._names: dict[int, str] = {}
         self._schemas: dict[int, int] = {0: 0}
         self._channels: dict[int, int] = {}

@@ -43,7 +43,7 @@ from hilctl.recording.mcap_records import (
     parse,
     split,
 )
-from hilctl.recording.metadata_keys import unsealed
+from hilctl.recording.metadata_keys import AXIS_FACT, unsealed
 from hilctl.recording.validation import MessageValidator, block_problem, decode
 
 _WINDOW_BYTES = 4 * 2**20
@@ -164,13 +164,13 @@ def _decodes(message: Message) -> bool:
 
 
 @cache
-def own_channels() -> dict[int, tuple[Schema, Channel]]:
+def own_channels(axis: str = "") -> dict[int, tuple[Schema, Channel]]:
     """Return schema and channel of each channel id of hilctl, in order."""
     descriptors = schema.descriptor_set()
     return {
         number: (
             Schema(number, descriptors, "protobuf", f"hilctl.{name}"),
-            Channel(number, topic, "protobuf", {}, number),
+            Channel(number, schema.topic_of(axis, topic), "protobuf", {}, number),
         )
         for number, (topic, name) in enumerate(schema.TOPICS.items(), start=1)
     }
@@ -237,6 +237,7 @@ class RecoveryScan:
         self._data_ended = False
         self._crc = zlib.crc32(MAGIC)
         self._channels: set[int] = set()
+        self._axis = ""
         self._indexes: dict[int, bytes] = {}
         self._chunks: list[int] = []
         self._indexed: list[int] = []
@@ -351,10 +352,16 @@ class RecoveryScan:
             return []
         if isinstance(record, Header):
             self.header = record
-        if isinstance(record, Metadata) and not unsealed(record.name, record.metadata)[1]:
-            what = f"metadata {record.name} with a wrong checksum"
-            self.damages.append(Damage(at, found.end - at, what, lasting=True))
+        if isinstance(record, Metadata):
+            self._check_facts(at, found.end, record)
         return [record]
+
+    def _check_facts(self, at: int, end: int, record: Metadata) -> None:
+        facts, right = unsealed(record.name, record.metadata)
+        self._axis = facts.get(AXIS_FACT, self._axis)
+        if not right:
+            what = f"metadata {record.name} with a wrong checksum"
+            self.damages.append(Damage(at, end - at, what, lasting=True))
 
     def _check_data(self, at: int, end: DataEnd) -> None:
         """Compare the checksum of the data section, if there is one."""
@@ -395,7 +402,7 @@ class RecoveryScan:
                 yield record
 
     def _lost_channels(self) -> Iterator[McapRecord]:
-        for number, pair in own_channels().items():
+        for number, pair in own_channels(self._axis).items():
             if number not in self._channels:
                 self._channels.add(number)
                 for record in pair:

@@ -1,8 +1,12 @@
-"""Protobuf schemas of a recording's topics.
+"""Topics of a recording, and their protobuf schemas.
+
+In a run of several axes each topic begins with the axis (``/x/samples``), so that applications can
+open the recordings of all axes together.
 
 A field number is never reused. :class:`hilctl.base.samples.Samples` has those of the columns.
 """
 
+import re
 from functools import cache
 from typing import Any, TypeAlias
 
@@ -26,6 +30,19 @@ TOPICS: dict[str, str] = {
     "/events": "Event",
 }
 """Message name per topic, in package ``hilctl``."""
+_OF_AXIS = re.compile(r"(/[a-z][a-z0-9_]*)?(/[a-z]+)")
+
+
+def topic_of(axis: str, topic: str) -> str:
+    """Return the topic of an axis; the topic itself for an empty name."""
+    return f"/{axis}{topic}" if axis else topic
+
+
+def split_topic(name: str) -> tuple[str, str]:
+    """Return the axis of a topic, empty without one, and the topic without it."""
+    found = _OF_AXIS.fullmatch(name)
+    return ((found[1] or "").lstrip("/"), found[2]) if found else ("", name)
+
 
 # name: (number, type, repeated); units are in the names
 _Fields: TypeAlias = dict[str, tuple[int, Any, bool]]

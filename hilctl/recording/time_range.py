@@ -12,6 +12,7 @@ from mcap.records import AttachmentIndex, Channel, ChunkIndex, McapRecord, Metad
 from hilctl.base.errors import DataError
 from hilctl.base.samples import LAST_SAMPLE
 from hilctl.base.segments import Segment
+from hilctl.recording import schema
 from hilctl.recording.mcap_records import FOOTER_BYTES, LARGEST_BYTES, footer_of, records_from
 from hilctl.recording.metadata_keys import unsealed
 from hilctl.recording.recording import Recording
@@ -122,7 +123,8 @@ def places_of(stream: BinaryIO, time_range: TimeRange) -> list[int] | None:
     summary = _summary(stream)
     chunks = [record for record in summary if isinstance(record, ChunkIndex)]
     indexes = [record for record in summary if isinstance(record, AttachmentIndex | MetadataIndex)]
-    events = {r.id for r in summary if isinstance(r, Channel) and r.topic == "/events"}
+    channels = [record for record in summary if isinstance(record, Channel)]
+    events = {each.id for each in channels if schema.split_topic(each.topic)[1] == "/events"}
     facts = _run_facts(stream, indexes)
     try:
         rate_hz = number_of(facts, "sample_rate_hz", *RATES_HZ)

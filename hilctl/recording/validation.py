@@ -172,13 +172,14 @@ class MessageValidator:
         self._schemas: dict[int, str] = {}
         self._topics: dict[int, str] = {}
         self._refused: dict[int, str] = {}
+        self._axis: str | None = None
         self.next_sample = 0
         """Index after the last sample of the valid messages."""
         self.samples = 0
         """Samples in valid messages."""
 
     def topic(self, channel: int) -> str:
-        """Return the topic of a channel if it is a topic of hilctl, otherwise an empty text."""
+        """Return the topic of a channel without its axis; empty if it is not one of hilctl."""
         return self._topics.get(channel, "")
 
     def problem(self, record: McapRecord) -> str:
@@ -198,15 +199,21 @@ class MessageValidator:
     def _channel(self, channel: Channel) -> None:
         self._topics.pop(channel.id, None)
         self._refused.pop(channel.id, None)
-        if channel.topic not in schema.TOPICS:
+        axis, topic = schema.split_topic(channel.topic)
+        if topic not in schema.TOPICS:
             return
-        own = f"hilctl.{schema.TOPICS[channel.topic]}"
+        own = f"hilctl.{schema.TOPICS[topic]}"
         name = self._schemas.get(channel.schema_id, "")
-        if name == own and channel.message_encoding == "protobuf":
-            self._topics[channel.id] = channel.topic
-        else:
-            text = f"{channel.topic}: must hold {own} in protobuf, got {short(name)}"
+        if name != own or channel.message_encoding != "protobuf":
+            if not axis:  # with another first part it may be a topic of another program
+                text = f"{channel.topic}: must hold {own} in protobuf, got {short(name)}"
+                self._refused[channel.id] = text
+        elif self._axis not in {None, axis}:
+            text = f"{channel.topic}: a recording has one axis, and the file has several"
             self._refused[channel.id] = text
+        else:
+            self._axis = axis
+            self._topics[channel.id] = topic
 
     def decoded(self, record: Message) -> tuple[Any, str]:
         """Return a decoded message of a topic of hilctl, and its problem, if any."""

@@ -22,7 +22,7 @@ from hilctl.base.files import begins_as_recording
 from hilctl.base.samples import BlockBatch
 from hilctl.base.segments import Segment
 from hilctl.recording.encoder import MessageMaker, RecordingLayout, Topics
-from hilctl.recording.metadata_keys import DEVICE_FILES, sealed
+from hilctl.recording.metadata_keys import AXIS_FACT, DEVICE_FILES, sealed
 from hilctl.recording.recording_files import lock
 
 _CHUNK_BYTES = 5 << 20
@@ -52,7 +52,7 @@ class RecordingWriter:
 
     def __init__(self, stream: "IO[bytes] | PendingFile", run: RunFacts) -> None:
         self._writer = mcap_writer(stream)
-        self._topics = Topics(self._writer)
+        self._topics = Topics(self._writer, run.facts.get(AXIS_FACT, ""))
         self._maker = MessageMaker(run.layout)
         self._late_missing = 0
         self._begin(run)

@@ -6,12 +6,15 @@ from pathlib import Path
 import numpy as np
 import pytest
 import yaml
+from mcap.reader import make_reader
 
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
 from hilctl.kernels.interlock import InterlockFlag
 from hilctl.recording.reader import read
+from hilctl.recording.recover import recover_recording
+from hilctl.recording.schema import TOPICS
 from hilctl.run.run_folder import runs
 from hilctl.run.start import checked_run, start_run
 from hilctl.run.unpaced import run_unpaced
@@ -146,6 +149,21 @@ def test_conditioning_of_one_axis_is_waited_for_by_the_other(tmp_path):
     assert replay(y).identical
     alone = read(unpaced(path, ["axis=y"], tmp_path / "y.mcap").path)
     assert_same_samples(y, alone)
+
+
+def test_recordings_of_a_run_have_topics_of_their_own(tmp_path):
+    experiment = stage(tmp_path, recording={"flush_s": 0.3})
+    result = unpaced(experiment, [], tmp_path / "run.mcap")
+    for name, axis in result.axes.items():
+        whole = read(axis.path)
+        axis.path.write_bytes(axis.path.read_bytes()[: axis.path.stat().st_size // 2])
+        for path in (recover_recording(axis.path).original, axis.path):
+            found = read(path).samples
+            assert 0 < found.index.size < whole.samples.index.size
+            assert np.array_equal(found.command, whole.samples.command[: found.index.size])
+        with axis.path.open("rb") as stream:
+            channels = make_reader(stream).get_summary().channels.values()
+        assert {each.topic for each in channels} == {f"/{name}{topic}" for topic in TOPICS}
 
 
 def test_a_refused_axis_leaves_no_file(tmp_path):

@@ -249,3 +249,14 @@ def test_tolerated_deviations_from_the_format():
 def test_texts_without_segments(text):
     with pytest.raises(ValueError, match="segments: "):
         validation.segments_of(text)
+
+
+def test_topics_of_one_axis_are_those_of_a_recording():
+    validator = validation.MessageValidator()
+    for number, name in ((1, "hilctl.SampleBlock"), (2, "robot.Pose")):
+        assert validator.problem(Schema(number, b"", "protobuf", name)) == ""
+    for number, (topic, schema_id) in enumerate([("/x/samples", 1), ("/robot/samples", 2)]):
+        assert validator.problem(Channel(number, topic, "protobuf", {}, schema_id)) == ""
+    assert [validator.topic(number) for number in range(2)] == ["/samples", ""]
+    for topic in ("/y/samples", "/samples"):
+        assert "one axis" in validator.problem(Channel(3, topic, "protobuf", {}, 1))
