@@ -99,7 +99,9 @@ class RunConnection:
         """
         return mark_run(self._folder, text)
 
-    def frames(self, every_s: float = 0.1, window_s: float = 0.5) -> Iterator["RunFrame"]:
+    def frames(
+        self, every_s: float = 0.1, window_s: float = 0.5, axis: str = ""
+    ) -> Iterator["RunFrame"]:
         """Yield frames of the run's signals, metrics and events until the run ends.
 
         Frames are read from the run's shared memory, so the run is not affected. A slow caller gets
@@ -108,9 +110,10 @@ class RunConnection:
         Args:
             every_s: Interval of the frames.
             window_s: Duration that each frame shows.
+            axis: Axis of a run of several; default: the first one.
 
         Raises:
-            InputError: An argument is out of range.
+            InputError: An argument is out of range, or the run has no such axis.
             RunError: The run has ended.
         """
         for name, value, least in (("every_s", every_s, 0.0), ("window_s", window_s, 1e-3)):
@@ -118,7 +121,8 @@ class RunConnection:
                 raise InputError(f"{name} must be from {least:g} to 100000 s (got {value:g})")
         from hilctl.live.run_reader import RunReader, frames_of
 
-        return frames_of(RunReader(self._folder), every_s, window_s, time.monotonic, time.sleep)
+        reader = RunReader(self._folder, axis)
+        return frames_of(reader, every_s, window_s, time.monotonic, time.sleep)
 
     def stop(self, wait_s: float = 60.0) -> None:
         """Stop the run: ramp to the safe value, and wait until the recording is closed.

@@ -69,7 +69,7 @@ def main() -> None:
         while not run and os.getppid() == supervisor:
             time.sleep(_SEARCH_S)
             own = (each for each in active_runs() if each.card.supervisor == supervisor)
-            run = next((each for each in own if each.description.exists()), None)
+            run = next((each for each in own if each.description_of(0).exists()), None)
         if run:
             try:
                 _watch(run)

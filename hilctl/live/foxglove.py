@@ -4,6 +4,8 @@
 the first sample of each bucket; `/scope_low` and `/scope_high` have the minimum and maximum of each
 signal per bucket, so that every spike is visible. `/diagnostics` has the state and the limits.
 
+In a run of several axes the topics are those of each axis, such as `/x/scope`, and `/diagnostics`.
+
 Clients are read-only. The library checks neither the user nor the origin of a request, so every
 user and every web page on this computer can read the run while the server is active. It is
 therefore started on request only.
@@ -81,9 +83,10 @@ _COLUMNS = {
 
 
 class LiveTopics:
-    """The messages of one run, with the Unix time of its sample 0."""
+    """The messages of one axis of a run, with the Unix time of its sample 0."""
 
     def __init__(self, feed: RunReader, start_unix_ns: int) -> None:
+        self.axis = feed.axis
         self._feed, about = feed, feed.description
         self._layout = RecordingLayout(
             sample_rate_hz=about.sample_rate_hz,
@@ -131,7 +134,8 @@ class LiveTopics:
 
 def _statuses(status: dict[str, Any]) -> list[dict[str, Any]]:
     """Return the parts of ``/diagnostics`` from :meth:`hilctl.live.run_reader.RunReader.status`."""
-    run, failed = status["run"], status["state"] == "fault" or status["safe"] is False
+    run = " ".join(filter(None, (status["run"], status["axis"])))
+    failed = status["state"] == "fault" or status["safe"] is False
     keys = ("t_s", "total_s", "segment", "gain", "offset", "inverse", "recording")
     late = {f"{name}_us": value for name, value in status["lateness_us"].items()}
     missed = {"missed_samples": status["missed_samples"]}
@@ -174,8 +178,9 @@ class FoxgloveServer:
     def __init__(self, chosen: Callable[[list[RunFolder]], RunFolder | None], port: int) -> None:
         self._feeds = RunList(chosen)
         self._shown: RunReader | None = None
-        self._topics: LiveTopics | None = None
-        self._context, self._channels, self._server = _started(port)
+        self._topics: list[LiveTopics] = []
+        self._context, self._server = _started(port)
+        self._channels = _channels(self._context, "")
 
     @property
     def url(self) -> str:
@@ -204,25 +209,39 @@ class FoxgloveServer:
         if feed is not self._shown:
             if self._shown is not None:
                 self._server.clear_session()  # discards client data of another run
-            self._shown, self._topics = feed, None
+            self._shown, self._topics = feed, []
         if feed is None:
             return
-        feed.poll(now_s)
-        if self._topics is None:
+        feeds = self._feeds.axes(None)
+        for each in feeds:
+            each.poll(now_s)
+        if not self._topics:
             if not feed.start_ns:
                 return
             start_unix_ns = time.time_ns() - round(now_s * 1e9) + feed.start_ns
-            self._topics = LiveTopics(feed, start_unix_ns)
-        wanted = [topic for topic in SCOPE_TOPICS if self._channels[topic].has_sinks()]
-        messages = [*self._topics.scope(wanted), *self._topics.events()]
-        if number % _STATUS_FRAMES == 0:
-            messages.append(self._topics.diagnostics(time.time_ns()))
+            self._topics = [LiveTopics(each, start_unix_ns) for each in feeds]
+            for axis in feed.axes:
+                if schema.topic_of(axis, "/events") not in self._channels:
+                    self._channels |= _channels(self._context, axis)
+        for topics in self._topics:
+            self._publish(topics, diagnoses=number % _STATUS_FRAMES == 0)
+
+    def _publish(self, topics: LiveTopics, *, diagnoses: bool) -> None:
+        """Send the new messages of an axis."""
+        channels = {
+            topic: self._channels[schema.topic_of(topics.axis, topic)] for topic in MESSAGES
+        }
+        channels[DIAGNOSTICS] = self._channels[DIAGNOSTICS]
+        wanted = [topic for topic in SCOPE_TOPICS if channels[topic].has_sinks()]
+        messages = [*topics.scope(wanted), *topics.events()]
+        if diagnoses:
+            messages.append(topics.diagnostics(time.time_ns()))
         for message in messages:
-            self._channels[message.topic].log(message.data, log_time=message.time_ns)
+            channels[message.topic].log(message.data, log_time=message.time_ns)
 
 
-def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServer"]:
-    """Return the context, without which the server loses its channels, the channels, the server."""
+def _started(port: int) -> tuple["Context", "WebSocketServer"]:
+    """Return the context, without which the server loses its channels, and the server."""
     try:
         import foxglove
     except ImportError:
@@ -237,15 +256,6 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
     root.setLevel(level)
     root.handlers[:] = handlers
     context = foxglove.Context()
-    descriptors = schema.descriptor_set()
-    channels = {
-        DIAGNOSTICS: foxglove.Channel(DIAGNOSTICS, schema=DIAGNOSTICS_SCHEMA, context=context)
-    }
-    for topic, name in MESSAGES.items():
-        form = foxglove.Schema(name=f"hilctl.{name}", encoding="protobuf", data=descriptors)
-        channels[topic] = foxglove.Channel(
-            topic, schema=form, message_encoding="protobuf", context=context
-        )
     try:
         # No capabilities: clients can only subscribe.
         server = foxglove.start_server(
@@ -254,4 +264,24 @@ def _started(port: int) -> tuple["Context", dict[str, "Channel"], "WebSocketServ
         )  # fmt: skip
     except RuntimeError as error:
         raise InputError(f"--port {port}: {error}") from None
-    return context, channels, server
+    return context, server
+
+
+def _channels(context: "Context", axis: str) -> dict[str, "Channel"]:
+    """Return new channels of the topics of an axis; those without an axis are of a whole run."""
+    import foxglove
+
+    channels = {}
+    if not axis:
+        channels[DIAGNOSTICS] = foxglove.Channel(
+            DIAGNOSTICS, schema=DIAGNOSTICS_SCHEMA, context=context
+        )
+    for topic, name in MESSAGES.items():
+        form = foxglove.Schema(
+            name=f"hilctl.{name}", encoding="protobuf", data=schema.descriptor_set()
+        )
+        named = schema.topic_of(axis, topic)
+        channels[named] = foxglove.Channel(
+            named, schema=form, message_encoding="protobuf", context=context
+        )
+    return channels

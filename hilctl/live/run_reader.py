@@ -8,16 +8,18 @@ import json
 import math
 import os
 import struct
-from collections.abc import Callable, Iterable, Iterator
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any, Literal, TypeAlias
 
 import numpy as np
 
-from hilctl.base.errors import RunError
+from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import Event
+from hilctl.base.formatting import did_you_mean
 from hilctl.base.segments import Segment
 from hilctl.base.types import F64
 from hilctl.live.live_metrics import (
@@ -28,7 +30,7 @@ from hilctl.live.live_metrics import (
     LiveErrorSpectrum,
     RunningMetrics,
 )
-from hilctl.live.scope import SIGNALS, WINDOWS_S, Scope, Signal, Traces, traces_of
+from hilctl.live.scope import ROW, SIGNALS, WINDOWS_S, Scope, Signal, Traces, traces_of
 from hilctl.run.control.client import active_runs
 from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import RunFolder
@@ -41,16 +43,28 @@ _SEARCH_S = 1.0  # interval of searches for runs
 
 
 class RunReader:
-    """Reader of one active run; raise RunError if it has ended, or cannot be read."""
+    """Reader of one axis of an active run, by default the first one.
 
-    def __init__(self, folder: RunFolder) -> None:
+    Raise RunError if the run has ended, or cannot be read, and InputError if it has no such axis.
+    """
+
+    def __init__(self, folder: RunFolder, axis: str = "") -> None:
         self.folder = folder
+        self.axes = [*folder.card.axes]
+        """Names of the axes; empty if there is only one."""
+        if axis and axis not in self.axes:
+            known = did_you_mean(axis, self.axes) or "the run has one axis"
+            raise InputError(f"{folder.card.name}: no axis is named {axis!r} ({known})")
+        number = self.axes.index(axis) if axis else 0
+        self.axis = self.axes[number] if self.axes else ""
+        self.recording = folder.card.recordings[number]
         try:
-            self.description = RunDescription.read(folder.description)
-            self._ring = SampleRing(folder.ring, look_only=True)
+            self.description = RunDescription.read(folder.description_of(number))
+            self._ring = SampleRing(folder.ring_of(number), look_only=True)
+            # The page of the run; that of the axis has its samples, events and changes.
+            self._page = SampleRing(folder.ring, look_only=True).page
         except (OSError, ValueError) as error:
             raise RunError(f"{folder.card.name}: cannot read the run: {error}") from None
-        self._page = self._ring.page
         aux = (Signal(each.name, each.name, each.unit) for each in self.description.aux)
         self.signals = (*SIGNALS, *aux)  # in the order of their rows
         self.scope = self._new_scope([])
@@ -61,10 +75,14 @@ class RunReader:
         self._lateness, self._headroom = LatenessCounts(), Headroom(self.description)
         self.events: list[Event] = []  # the newest ones, the oldest first
         self._events_seen = 0
+        self.peak_error_um = math.nan
+        """Largest error of single samples since the last reset."""
+        self._reset_at = 0
         self.missed = 0  # samples not read: dropped by the run, or overwritten too early
         self.ended = False  # whether the run has ended and no data can follow
         self._disk: dict[str, int] | None = None
-        self._next_block, self._next_event = max(0, self._page.observe(PageField.HEAD) - 1), 0
+        self._next_block = max(0, self._ring.page.observe(PageField.HEAD) - 1)
+        self._next_event = 0
         self._next_sample, self._next_note = -1, 0
         self._looked_s = -math.inf
 
@@ -79,13 +97,13 @@ class RunReader:
             self._looked_s = now_s
             # Checked first: an ended run writes no more data after this.
             self.ended = not self.folder.alive
-            self._disk = _disk_room(Path(self.folder.card.recording))
+            self._disk = _disk_room(self.recording)
         if self._page.observe(PageField.PHASE) < Phase.RUNNING:
             return False
         self._begin()
         batch, self._next_block = self._ring.look(self._next_block)
-        events, self._next_event = self._page.look_at_events(self._next_event)
-        notes, self._next_note = self._page.look_at_notes(self._next_note)
+        events, self._next_event = self._ring.page.look_at_events(self._next_event)
+        notes, self._next_note = self._ring.page.look_at_notes(self._next_note)
         self.events = (self.events + events + notes)[-_EVENTS:]
         self._events_seen += len(events) + len(notes)
         if not batch.heads.shape[0]:
@@ -97,7 +115,7 @@ class RunReader:
     def _begin(self) -> None:
         """Read the first sample of the waveform, which is known once the loop runs."""
         if self._waveform_at < 0:
-            self._waveform_at = self._page.get(PageField.WAVEFORM_AT)
+            self._waveform_at = self._ring.page.get(PageField.WAVEFORM_AT)
             segments = self.description.segments_at(self._waveform_at)
             self.scope = self._new_scope(segments)
 
@@ -114,6 +132,12 @@ class RunReader:
         self._metrics.add(traces, self.scope.segment)
         self.spectrum.add(traces)
         self._headroom.add(traces)
+        error_um = np.abs(traces.values[ROW["error"]])
+        self.peak_error_um = float(np.fmax.reduce(error_um, initial=self.peak_error_um))
+
+    def reset_peak(self) -> None:
+        """Begin a new :attr:`peak_error_um`."""
+        self.peak_error_um, self._reset_at = math.nan, max(self._next_sample, 0)
 
     def events_since(self, seen: int) -> tuple[list[Event], int]:
         """Return the events after the first ``seen``, and the number of all events."""
@@ -140,13 +164,14 @@ class RunReader:
         """State of the inverse after the last change, ``in`` or ``out``; None without one."""
         if not self.description.compensator:
             return None
-        changed = self._page.get(PageField.TUNE_NUMBER)
-        return "out" if changed and not self._page.get_float(PageField.TUNE_INVERSE_SHARE) else "in"
+        page = self._ring.page
+        changed = page.get(PageField.TUNE_NUMBER)
+        return "out" if changed and not page.get_float(PageField.TUNE_INVERSE_SHARE) else "in"
 
     def status(self) -> dict[str, Any]:
         """Return everything except the traces, as plain values for JSON."""
-        page, rate_hz = self._page, self.description.sample_rate_hz
-        outcome, tuned = page.outcome(), page.get(PageField.TUNE_NUMBER)
+        page, rate_hz = self._ring.page, self.description.sample_rate_hz
+        outcome, tuned = self._page.outcome(), page.get(PageField.TUNE_NUMBER)
         late = self._lateness.percentiles_us()
         killed = "no outcome from the loop: see the report" if self.ended else ""
         ring_used = (page.get(PageField.HEAD) - page.get(PageField.TAIL)) / self._ring.slots
@@ -154,7 +179,9 @@ class RunReader:
         gauges.append(Gauge("ring", ring_used, 100.0 * ring_used, 100.0, "%"))
         return {
             "run": self.folder.card.name,
-            "recording": self.folder.card.recording,
+            "axis": self.axis,
+            "axes": self.axes,
+            "recording": str(self.recording),
             "state": self.state,
             "reason": outcome.reason if outcome else killed,
             "safe": outcome.safe if outcome else None,
@@ -163,6 +190,7 @@ class RunReader:
             "total_s": (self.description.samples + max(self._waveform_at, 0)) / rate_hz,
             "segment": self.scope.segment.label if self.scope.segment else "",
             "figures": self._metrics.newest,
+            "peak_error": {"um": self.peak_error_um, "since_s": self._reset_at / rate_hz},
             "aux": [
                 {"name": each.name, "unit": each.unit, "value": value}
                 for each, value in zip(self.description.aux, self._aux, strict=False)
@@ -171,7 +199,7 @@ class RunReader:
             "offset": page.get_float(PageField.TUNE_OFFSET) if tuned else 0.0,
             "inverse": self.inverse,
             "missed_samples": self.missed,
-            "late_ticks": page.get(PageField.LATE_TICKS),
+            "late_ticks": self._page.get(PageField.LATE_TICKS),
             "lateness_us": late,
             "lateness_edges_us": EDGES_US.tolist(),
             "lateness_counts": self._lateness.counts.tolist(),
@@ -197,7 +225,7 @@ def _disk_room(recording: Path) -> dict[str, int] | None:
 
 
 class RunList:
-    """Readers of the active runs, each created when it is first requested.
+    """Readers of the axes of active runs, created when the run is first requested.
 
     ``chosen`` returns the run to show if none is named.
     """
@@ -205,13 +233,13 @@ class RunList:
     def __init__(self, chosen: Callable[[list[RunFolder]], RunFolder | None]) -> None:
         self.runs: list[RunFolder] = []
         self._chosen = chosen
-        self._feeds: dict[str, RunReader] = {}
+        self._feeds: dict[str, list[RunReader]] = {}
         self._main = ""
         self._looked_s = float("-inf")
 
     def __iter__(self) -> Iterator[RunReader]:
-        """Iterate over the readers that were requested."""
-        return iter(self._feeds.values())
+        """Iterate over the readers of all requested runs."""
+        return chain.from_iterable(self._feeds.values())
 
     def update(self, now_s: float, shown: Iterable[str | None] = ()) -> None:
         """Update the list of active runs once per second; remove ended runs that are not shown.
@@ -221,14 +249,18 @@ class RunList:
         if now_s - self._looked_s < _SEARCH_S:
             return
         self._looked_s, self.runs = now_s, active_runs()
-        feeds = [self.feed(name) for name in shown]
-        kept = {self._main, *(feed.folder.card.name for feed in feeds if feed is not None)}
+        kept = {self._main, *(feed.folder.card.name for name in shown for feed in self.axes(name))}
         self._feeds = {
-            name: feed for name, feed in self._feeds.items() if not feed.ended or name in kept
+            name: feeds for name, feeds in self._feeds.items() if not feeds[0].ended or name in kept
         }
 
-    def feed(self, name: str | None) -> RunReader | None:
-        """Return the reader of a run that is active, or was when first requested."""
+    def feed(self, name: str | None, axis: str | None = None) -> RunReader | None:
+        """Return the reader of an axis of a run, or of its first one if it has no such axis."""
+        feeds = self.axes(name)
+        return next((each for each in feeds if each.axis == axis), feeds[0] if feeds else None)
+
+    def axes(self, name: str | None) -> list[RunReader]:
+        """Return the readers of a run that is active, or was when first requested."""
         if name is None:
             name = self._main = self._main_run()
         if name in self._feeds:
@@ -236,13 +268,12 @@ class RunList:
         found = next((run for run in self.runs if run.card.name == name), None)
         if found is not None:
             with suppress(RunError):  # the run is just being started or removed
-                self._feeds[name] = RunReader(found)
-        return self._feeds.get(name)
+                self._feeds[name] = [RunReader(found, axis) for axis in found.card.axes or [""]]
+        return self._feeds.get(name, [])
 
     def _main_run(self) -> str:
         """Return the default run; an ended run remains until there is another."""
-        feed = self._feeds.get(self._main)
-        if feed is not None and not feed.ended:
+        if self._main in self._feeds and not self._feeds[self._main][0].ended:
             return self._main
         chosen = self._chosen(self.runs)
         return self._main if chosen is None else chosen.card.name
@@ -256,15 +287,29 @@ def nearest_window_s(wanted_s: float) -> float:
     return min(WINDOWS_S, key=lambda each: max(each / wanted_s, wanted_s / each))
 
 
-def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
+NO_PATH = np.empty((4, 0))
+
+
+def path_of(scopes: Sequence[Scope], window_s: float) -> F64:
+    """Return the newest ``window_s`` of two axes of a run, the oldest samples first.
+
+    Rows are reference and displacement of the first axis, then of the second one: float64[4, n].
+    """
+    newest = min(each.newest_position(window_s) for each in scopes)
+    return np.concatenate([each.positions(window_s, newest) for each in scopes])
+
+
+def frame_of(scope: Scope, mode: ScopeMode, window_s: float, path: F64 = NO_PATH) -> bytes:
     """Return the current frame of a page; without a cycle, mode ``cycle`` rolls.
 
-    The length of a rolling window is one of :data:`hilctl.live.scope.WINDOWS_S`. A frame is::
+    The length of a rolling window is one of :data:`hilctl.live.scope.WINDOWS_S`; ``path`` is that
+    of two axes, see :func:`path_of`. A frame is::
 
         uint32 little endian   size of the JSON in bytes, with spaces up to a multiple of 4
         JSON                   ``mode``, ``n`` buckets, number of ``signals``, ``loop`` points of
-                               the loops, ``cycle`` points per cycle
-        float32 little endian  t_s[n], low[signals, n], high[signals, n], input[loop], output[loop]
+                               the loops, ``cycle`` points per cycle, ``path`` points of the path
+        float32 little endian  t_s[n], low[signals, n], high[signals, n], input[loop], output[loop],
+                               path[4, path]
     """
     cycles = scope.triggered() if mode == "cycle" else None
     window, loops = cycles or scope.rolling(window_s), scope.loops()
@@ -274,10 +319,11 @@ def frame_of(scope: Scope, mode: ScopeMode, window_s: float) -> bytes:
         "signals": window.buckets.low.shape[0],
         "loop": loops.shape[1],
         "cycle": scope.points_a_cycle(),
+        "path": path.shape[1],
     }
     header = json.dumps(facts).encode()
     header += b" " * (-len(header) % 4)
-    parts = (window.t_s, window.buckets.low, window.buckets.high, loops)
+    parts = (window.t_s, window.buckets.low, window.buckets.high, loops, path)
     values = np.concatenate([np.ravel(part) for part in parts]).astype("<f4")
     return struct.pack("<I", len(header)) + header + values.tobytes()
 

@@ -24,7 +24,7 @@ from functools import cache
 from http import HTTPStatus
 from importlib.resources import files
 from pathlib import Path
-from typing import Annotated, Any, Literal
+from typing import Annotated, Any, Literal, TypeAlias
 
 from pydantic import Field, ValidationError
 from websockets.asyncio.server import ServerConnection, serve
@@ -39,7 +39,15 @@ from hilctl.base.files import ADDRESS_REMEDIES, reason
 from hilctl.base.formatting import finite_json, printable
 from hilctl.base.strict import HALF_CHARACTER, StrictModel, first_problem, without_halves
 from hilctl.base.subprocesses import python_command
-from hilctl.live.run_reader import RunList, RunReader, ScopeMode, frame_of, nearest_window_s
+from hilctl.live.run_reader import (
+    NO_PATH,
+    RunList,
+    RunReader,
+    ScopeMode,
+    frame_of,
+    nearest_window_s,
+    path_of,
+)
 from hilctl.run.control.client import ask, request_stop
 from hilctl.run.run_folder import RunFolder
 
@@ -51,25 +59,42 @@ SLOW_S = 5.0
 """A page that reads nothing for this time is disconnected."""
 
 
+WindowLength: TypeAlias = Annotated[float, Field(ge=1e-3, le=1e5)]
+
+
 class PageView(StrictModel):
-    """Run (None for the server's default), mode and rolling window that a page shows."""
+    """What a page shows.
+
+    Attributes:
+        run: The run; None for the server's default.
+        axis: Its axis; None for the first one.
+        mode: Mode of the scope.
+        window_s: Length of the rolling window.
+        across: Axis on the abscissa of the path; empty for no path.
+        up: Axis on the ordinate of the path.
+        path_s: Length of the path.
+    """
 
     run: str | None = None
+    axis: str | None = None
     mode: ScopeMode = "cycle"
-    window_s: Annotated[float, Field(ge=1e-3, le=1e5)] = 2.0
+    window_s: WindowLength = 2.0
+    across: str = ""
+    up: str = ""
+    path_s: WindowLength = 2.0
 
 
 class PageMessage(StrictModel):
     """Message of a page; its number is returned with the answer.
 
     ``view`` changes the :class:`PageView`, ``stop`` stops the run, ``report`` makes the report of
-    its recording, ``run`` sends a request to the run's control socket. They concern the named run,
-    by default the one of the view.
+    its recording, ``reset`` begins a new peak error of the view's axis, ``run`` sends a request to
+    the run's control socket. They concern the named run, by default the one of the view.
     """
 
     id: int
     run: str | None = None
-    ask: Literal["view", "stop", "report", "run"]
+    ask: Literal["view", "stop", "report", "reset", "run"]
     view: dict[str, Any] = Field(default_factory=dict)
     request: dict[str, Any] = Field(default_factory=dict)
 
@@ -339,7 +364,7 @@ class LiveServer:
             return answer_text(message, ok=False, error=str(error))
 
     async def _executed(self, viewer: PageSession, message: PageMessage) -> dict[str, Any]:
-        feed = self._feeds.feed(message.run or viewer.view.run)
+        feed = self._feeds.feed(message.run or viewer.view.run, viewer.view.axis)
         if message.ask == "view":
             return {"ok": True}
         if feed is None:
@@ -349,8 +374,11 @@ class LiveServer:
             if not requested and feed.folder.alive:
                 raise RunError("its supervisor is gone; its loop ramps down by itself")
             return {"ok": True, "requested": requested, "run": feed.folder.card.name}
+        if message.ask == "reset":
+            feed.reset_peak()
+            return {"ok": True}
         if message.ask == "report":
-            return {"ok": True, "path": await self._report(Path(feed.folder.card.recording))}
+            return {"ok": True, "path": await self._report(feed.recording)}
         answer = await asyncio.to_thread(ask, feed.folder.socket, message.request, _REQUEST_S)
         return {"ok": True, **answer}
 
@@ -389,20 +417,28 @@ class LiveServer:
         self._feeds.feed(None)  # read from the first sample, even without a page
         for feed in self._feeds:
             feed.poll(now_s)
-        frames: dict[tuple[str, str, float], bytes] = {}
+        frames: dict[tuple[str, PageView], bytes] = {}
         for viewer in [each for each in self._viewers if each.ready]:
-            shown, view = self._feeds.feed(viewer.view.run), viewer.view
-            # A frame never precedes the status of its run.
-            name = shown.folder.card.name if shown is not None else ""
+            view = viewer.view
+            shown = self._feeds.feed(view.run, view.axis)
+            # A frame never precedes the status of its run and axis.
+            name = f"{shown.folder.card.name}/{shown.axis}" if shown is not None else ""
             due = number % _STATUS_FRAMES == 0 or viewer.run != name
             status, viewer.run = [self._status(shown)] if due else [], name
             if shown is None:
                 viewer.offer(*status)
                 continue
-            key = (name, view.mode, nearest_window_s(view.window_s))
+            key = (name, view)
             if key not in frames:
-                frames[key] = frame_of(shown.scope, view.mode, key[2])
+                frames[key] = self._frame(shown, view)
             viewer.offer(*status, frames[key])
+
+    def _frame(self, shown: RunReader, view: PageView) -> bytes:
+        path = NO_PATH
+        if view.across and view.up:
+            feeds = [self._feeds.feed(view.run, axis) or shown for axis in (view.across, view.up)]
+            path = path_of([each.scope for each in feeds], nearest_window_s(view.path_s))
+        return frame_of(shown.scope, view.mode, nearest_window_s(view.window_s), path)
 
     def _status(self, feed: RunReader | None) -> str:
         cards = [run.card for run in self._feeds.runs]

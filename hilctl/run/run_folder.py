@@ -103,10 +103,9 @@ class RunFolder:
         path = self.path / name
         return path.with_stem(f"{path.stem}-{axis}") if axis else path
 
-    @property
-    def description(self) -> Path:
-        """File of the run's description for watchers."""
-        return self._file("description.json")
+    def description_of(self, axis: int) -> Path:
+        """Return the file of the description of an axis for watchers, by its number."""
+        return self._file(self.file_of("description.json", axis).name)
 
     @property
     def job(self) -> Path:

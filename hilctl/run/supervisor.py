@@ -294,8 +294,9 @@ class Supervisor:
                 requests = Requests(self._checked, folder, pages, recording)
                 server = stack.enter_context(ControlServer(folder.socket, requests.answer))
                 self._write_job(folder, locks.descriptors)
-                # Kept open: watchers find it even if the folder is removed.
-                stack.enter_context(folder.description.open("rb"))
+                # Kept open: watchers find them even if the folder is removed.
+                for axis in range(len(rings)):
+                    stack.enter_context(folder.description_of(axis).open("rb"))
                 inherits = locks.descriptors + own
                 child = LoopProcess(folder, page, inherits)
                 run = folder, rings[0], child, recording
@@ -451,7 +452,7 @@ class Supervisor:
                     signal.signal(number, handler)
 
     def _write_job(self, folder: RunFolder, locks: list[int]) -> None:
-        """Write the job for loop and guardian, and the description for watchers."""
+        """Write the job for loop and guardian, and the descriptions for watchers."""
         recording = self._config.recording
         # The supervisor may be silent until half of the ring is full.
         silence_s = recording.ring_s / 2.0 if recording.on_failure == "stop" else float("inf")
@@ -464,7 +465,8 @@ class Supervisor:
             silence_s=silence_s,
         )
         job.write(folder.job)
-        RunDescription.of(self._checked.first).write(folder.description)
+        for number, axis in enumerate(self._checked.axes):
+            RunDescription.of(axis).write(folder.description_of(number))
 
     def _make_rings(self, folder: RunFolder) -> list[SampleRing]:
         """Return a ring per axis; the page of the first one is that of the run."""

@@ -41,7 +41,7 @@ def test_the_import_is_light():
 
 
 def test_frames_are_those_of_the_run(run, monkeypatch):
-    monkeypatch.setattr("hilctl.live.run_reader.RunReader", lambda folder: folder.card.name)
+    monkeypatch.setattr("hilctl.live.run_reader.RunReader", lambda folder, axis: folder.card.name)
     monkeypatch.setattr("hilctl.live.run_reader.frames_of", lambda *given: iter([given]))
     ((feed, every_s, window_s, clock, sleep),) = run.frames(0.2, 2.0)
     assert (feed, every_s, window_s) == ("sine-7", 0.2, 2.0)

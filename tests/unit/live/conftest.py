@@ -32,7 +32,7 @@ def active_run(description, place, slots=16):
 
 def begun(folder, description, slots=16):
     """Return the ring of a run whose loop is active."""
-    description.write(folder.description)
+    description.write(folder.description_of(0))
     aux = len(description.aux)
     ring = SampleRing.create(folder.ring, slots=slots, block=BLOCK, state_size=1, aux=aux)
     ring.page.put(PageField.PHASE, Phase.RUNNING)

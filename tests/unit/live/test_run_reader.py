@@ -122,7 +122,7 @@ def test_unreadable_run_is_an_error(tmp_path):
 def test_state_of_the_inverse(run):
     feed, ring = run
     assert feed.inverse == "in"
-    ring.page.put(PageField.TUNE_WANTED, 1)
+    ring.page.put(PageField.TUNE_NUMBER, 1)
     assert feed.status()["inverse"] == "out"
     ring.page.put_float(PageField.TUNE_INVERSE_SHARE, 1.0)
     assert feed.inverse == "in"
@@ -195,7 +195,7 @@ def decoded(frame):
 def test_a_frame_holds_the_window_and_the_loops(scope):
     frame = frame_of(scope, "cycle", 2.0)
     header, t_s, low, high, loops = decoded(frame)
-    assert header == {"mode": "cycle", "n": 100, "signals": 6, "loop": 300, "cycle": 50}
+    assert header == {"mode": "cycle", "n": 100, "signals": 6, "loop": 300, "cycle": 50, "path": 0}
     assert t_s == pytest.approx(np.arange(100) / 1000.0)
     assert low[ROW["error"]].tolist() == high[ROW["error"]].tolist() == list(range(500, 600))
     assert np.isnan(low[ROW["measured"]]).all()
