@@ -11,8 +11,8 @@ from hilctl.base.yaml import Document, Loc, dotted, loc_of
 AXIS_NAME = "[a-z][a-z0-9_]*"
 """Pattern of the names of axes."""
 MAX_AXES = 8
-RUN_KEYS = {"name", "description", "labels", "sample_rate_hz", "block", "trigger", "apart",
-            "timing", "recording", "realtime"}  # fmt: skip
+RUN_KEYS = {"name", "description", "labels", "sample_rate_hz", "block", "coupling", "trigger",
+            "apart", "timing", "recording", "realtime"}  # fmt: skip
 """Keys of an experiment that are the same for all axes."""
 
 
@@ -97,6 +97,7 @@ def _of_axis(document: Document) -> Document:
         raise ConfigError([document.problem("axis", "must name an axis", str(name), hint)])
     document.remove("axis")
     document.remove("apart")  # of two axes
+    document.remove("coupling")  # the others are at rest
     axis_documents(document)
     return document.part(("axes", name), name)  # with the trigger, also if it is not the first one
 

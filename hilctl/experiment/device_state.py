@@ -40,22 +40,27 @@ from hilctl.waveforms.build import Reference
 
 
 def start_of(
-    loaded: LoadedExperiment, reference: Reference, conditioned: F64, now: MachineTime
+    loaded: LoadedExperiment,
+    reference: Reference,
+    conditioned: F64,
+    now: MachineTime,
+    crosstalk_um: F64 | None = None,
 ) -> tuple[CompensatorStart, list[ConfigProblem]]:
     """Return input and initial state of the compensator, and the problems if one is unknown.
 
-    ``conditioned``, float64[m], are the commands before the waveform. Raise ModelError if the model
-    has no inverse.
+    ``conditioned``, float64[m], are the commands before the waveform, and ``crosstalk_um``,
+    float64[n], is subtracted from the input. Raise ModelError if the model has no inverse.
     """
     config = loaded.config
     problems: list[ConfigProblem] = []
     values = reference.values
-    if loaded.correction is not None:
-        try:
-            values = loaded.correction.added(reference, loaded.model)
-        except InputError as error:
-            hint = "learn again with 'hilctl learn', or remove it"
-            problems.append(broken("compensator.correction", str(error), hint=hint))
+    try:
+        values = corrected_um(loaded, reference)
+    except InputError as error:
+        hint = "learn again with 'hilctl learn', or remove it"
+        problems.append(broken("compensator.correction", str(error), hint=hint))
+    if crosstalk_um is not None:
+        values = values - crosstalk_um
     before, begins = None, ""
     try:
         before, begins = _state_before(loaded, conditioned, now)
@@ -71,6 +76,16 @@ def start_of(
         return replace(begun, stands_um=0.0), problems
     known = config.zero or config.measures_offset
     return (begun if known else replace(begun, stands_um=None)), problems
+
+
+def corrected_um(loaded: LoadedExperiment, reference: Reference) -> F64:
+    """Return a reference with its learned correction, if the experiment has one: float64[n].
+
+    Raise InputError if the correction belongs to another rate, model or waveform.
+    """
+    if loaded.correction is None:
+        return reference.values
+    return loaded.correction.added(reference, loaded.model)
 
 
 def _state_before(

@@ -60,6 +60,8 @@ class Experiment(StrictModel):
             A run that needs more is refused. Default: not checked.
         sample_rate_hz: Samples per second.
         block: Samples exchanged in one tick; more than 1 needs a device with a FIFO.
+        coupling: File of ``hilctl couple`` with the crosstalk between axes, which is removed from
+            their references before the run. Default: none.
         waveform: The reference.
         compensator: ``none``, or the model to invert.
         condition: Cycle before the waveform that erases the history of the actuator. Default: none.
@@ -85,6 +87,7 @@ class Experiment(StrictModel):
     amplifier: VoltageLimit | None = None
     sample_rate_hz: Annotated[float, Field(ge=1e-3, le=1e6)]
     block: Annotated[int, Field(ge=1, le=4096)] = 1
+    coupling: str | None = None
     waveform: AnyWaveform
     compensator: Annotated[
         CompensatorConfig | None,

@@ -28,6 +28,7 @@ from hilctl.experiment.file import Experiment
 from hilctl.experiment.rig import RunRig
 from hilctl.experiment.sections.conditioning import make_conditioning
 from hilctl.experiment.sections.correction import Correction, load_correction
+from hilctl.experiment.sections.coupling import Coupling, load_coupling
 from hilctl.experiment.sections.open_loop import MeasuredResponse, load_response
 from hilctl.experiment.sections.safe import safe_problems
 from hilctl.loop.lead_in import Conditioning
@@ -35,7 +36,7 @@ from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import load_model
 
 T = TypeVar("T")
-FILE_KEYS = {"compensator.model", "compensator.correction", "compensator.initial_state",
+FILE_KEYS = {"coupling", "compensator.model", "compensator.correction", "compensator.initial_state",
              "feedback.response", "waveform.path", "device.profile", "device.reader.profile",
              "device.calibration"}  # fmt: skip
 """Keys of an experiment that name files, relative to its own folder."""
@@ -53,6 +54,7 @@ class LoadedExperiment:
         document: The file, with the line of each value.
         correction: Learned correction of the reference, or None.
         response: Measured response for the margins of the feedback, or None.
+        coupling: Crosstalk between the axes of the run to remove, or None.
         files: Contents of the files it refers to.
         axis: Name of the axis; empty if it is the only one.
     """
@@ -65,6 +67,7 @@ class LoadedExperiment:
     document: Document
     correction: Correction | None = None
     response: MeasuredResponse | None = None
+    coupling: Coupling | None = None
     files: TextFiles = field(default_factory=TextFiles)
     axis: str = ""
 
@@ -192,13 +195,24 @@ def _resolved(
     model = _collect(problems, lambda: named("compensator.model", load_model))
     correction = _collect(problems, lambda: named("compensator.correction", load_correction))
     response = _collect(problems, lambda: named("feedback.response", load_response))
+    coupling = _collect(problems, lambda: named("coupling", load_coupling))
     if config is not None:
         problems += document.refusal(_joint_problems(config)).problems
     if problems or config is None or device is None:
         raise ConfigError(problems)
     yaml_text = dump(document.data)
     return LoadedExperiment(
-        config, device, model, folder, yaml_text, document, correction, response, files, axis
+        config,
+        device,
+        model,
+        folder,
+        yaml_text,
+        document,
+        correction,
+        response,
+        coupling,
+        files,
+        axis,
     )
 
 

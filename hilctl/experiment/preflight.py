@@ -5,7 +5,7 @@ in advance; the commands are compared with the limits.
 """
 
 import logging
-from collections.abc import Iterator, Sequence
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 
@@ -23,7 +23,7 @@ from hilctl.experiment.device_rules import (
     rate_problems,
     watchdog_problems,
 )
-from hilctl.experiment.device_state import heat_before, start_of
+from hilctl.experiment.device_state import corrected_um, heat_before, start_of
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.forecast import Forecast, forecast_of
 from hilctl.experiment.load import LoadedExperiment
@@ -46,6 +46,7 @@ from hilctl.experiment.sections.compensator import (
     start_problems,
 )
 from hilctl.experiment.sections.conditioning import condition_problems, zero_problems
+from hilctl.experiment.sections.coupling import coupled_feedback_problems, coupling_problems
 from hilctl.experiment.sections.cures import Course, cured
 from hilctl.experiment.sections.feedback import feedback_problems
 from hilctl.experiment.sections.limits import (
@@ -154,6 +155,11 @@ class CheckedRun:
         return self.first.loaded.config
 
     @property
+    def coupled(self) -> bool:
+        """Whether the input of each axis depends on the references of all."""
+        return self.first.loaded.coupling is not None
+
+    @property
     def names(self) -> list[str]:
         """Names of the axes; one empty name if there is only one."""
         return [each.loaded.axis for each in self.axes]
@@ -172,27 +178,54 @@ def check_axes(loaded: Sequence[LoadedExperiment], heat_a2: float | None = 0.0) 
     Raises:
         ConfigError: The run is rejected; all reasons are listed.
     """
-    now, axes = MachineTime.now(), list[CheckedExperiment]()
+    now = MachineTime.now()
+    axes = _checked_each(loaded, lambda one: check(one, heat_a2, now), _joint_problems(loaded))
+    samples = [each.reference.values.size for each in axes]
+    longest = axes[samples.index(max(samples))]
+    notes = []
+    for each in axes:
+        if each.reference.values.size < max(samples):
+            ends = f"{each.loaded.axis} ends after {each.forecast.duration_s:g} s"
+            until = f"{longest.loaded.axis} ends after {longest.forecast.duration_s:g} s"
+            notes.append(f"{ends} and holds its last value until {until}")
+    crosstalk_um = _crosstalk(axes, max(samples))
+    if notes or crosstalk_um:
+        axes = _checked_each(
+            loaded,
+            lambda one: check(one, heat_a2, now, max(samples), crosstalk_um.get(one.axis)),
+        )
+    limits = {each.axis: each.config.command_limits() for each in loaded}
+    return CheckedRun(tuple(axes), (*notes, *apart_notes(loaded[0].config.apart, limits)))
+
+
+def _checked_each(
+    loaded: Sequence[LoadedExperiment],
+    checked: Callable[[LoadedExperiment], CheckedExperiment],
+    joint: Iterable[ConfigProblem] = (),
+) -> list[CheckedExperiment]:
+    """Return the checked axes; raise ConfigError with their problems and the joint ones."""
+    axes = list[CheckedExperiment]()
     problems: dict[str, Sequence[ConfigProblem]] = {}
     for one in loaded:
         problems[one.axis] = ()
         try:
-            axes.append(check(one, heat_a2, now))
+            axes.append(checked(one))
         except ConfigError as error:
             problems[one.axis] = error.problems
-    if found := [*_joint_problems(loaded), *problems_of_axes(problems)]:
+    if found := [*joint, *problems_of_axes(problems)]:
         raise ConfigError(found)
-    samples = [each.reference.values.size for each in axes]
-    longest = axes[samples.index(max(samples))]
-    notes = []
-    for k, each in enumerate(axes):
-        if samples[k] < max(samples):
-            axes[k] = check(each.loaded, heat_a2, now, hold_until=max(samples))
-            ends = f"{each.loaded.axis} ends after {each.forecast.duration_s:g} s"
-            until = f"{longest.loaded.axis} ends after {longest.forecast.duration_s:g} s"
-            notes.append(f"{ends} and holds its last value until {until}")
-    limits = {each.axis: each.config.command_limits() for each in loaded}
-    return CheckedRun(tuple(axes), (*notes, *apart_notes(loaded[0].config.apart, limits)))
+    return axes
+
+
+def _crosstalk(axes: Sequence[CheckedExperiment], samples: int) -> dict[str, F64]:
+    """Return the crosstalk to remove from each axis, float64[samples]; none without a coupling."""
+    if (coupling := axes[0].loaded.coupling) is None:
+        return {}
+    wanted_um = {
+        each.loaded.axis: corrected_um(each.loaded, each.reference.held(samples)) for each in axes
+    }
+    rests_um = {each.loaded.axis: _rest(each.loaded) for each in axes}
+    return coupling.removed(wanted_um, rests_um)
 
 
 def _joint_problems(loaded: Sequence[LoadedExperiment]) -> Iterator[ConfigProblem]:
@@ -201,6 +234,9 @@ def _joint_problems(loaded: Sequence[LoadedExperiment]) -> Iterator[ConfigProble
     infos = {each.axis: each.device.info for each in loaded}
     if len(infos) < 2:
         return
+    models = {each.axis: each.model for each in loaded}
+    coupled = coupling_problems(loaded[0].coupling, models, config.sample_rate_hz)
+    yield from loaded[0].document.refusal(coupled).problems
     found = [*output_problems(infos)]
     found += clock_problems(infos, config.sample_rate_hz, config.block)
     found += [(loaded[0].axis, each) for each in apart_problems(config.apart, [*infos])]
@@ -213,12 +249,14 @@ def check(
     heat_a2: float | None = 0.0,
     now: MachineTime | None = None,
     hold_until: int = 0,
+    crosstalk_um: F64 | None = None,
 ) -> CheckedExperiment:
     """Compute the complete run and check it against device, model and limits.
 
     The heat of the coil is at least ``heat_a2``, in A^2, whatever the last run left; None for a
     coil that has cooled down by then. ``now`` is the time of the start; None for the present.
-    A waveform with fewer samples than ``hold_until`` holds its last value.
+    A waveform with fewer samples than ``hold_until`` holds its last value. The crosstalk of other
+    axes, float64[n], is removed from the compensator's input.
 
     Raises:
         ConfigError: The run is rejected; all reasons are listed, each with its amount.
@@ -233,11 +271,13 @@ def check(
     with _refused(loaded, "waveform", problems):
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder, rest)
         reference = reference.held(hold_until)
+    if crosstalk_um is not None:
+        reference = replace(reference, repeats=())  # the others may have another period
     _warn_of_long_work(reference)
     findings = range_findings(loaded.model, reference)
     problems += findings.refused
     with _refused(loaded, "compensator.model", problems):
-        begun, unknown_start = start_of(loaded, reference, conditioned, now)
+        begun, unknown_start = start_of(loaded, reference, conditioned, now, crosstalk_um)
         problems += unknown_start
         left_a2, unknown_heat = heat_before(loaded, now)
         heat_a2 = config.safe.value**2 if heat_a2 is None else max(heat_a2, left_a2)
@@ -284,8 +324,12 @@ def _section_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
     yield from trigger_problems(config.trigger, rig)
     yield from zero_problems(zero=config.zero, offset=config.measures_offset)
     yield from condition_problems(config.condition, rig)
-    if not loaded.axis:
+    rate_hz = config.sample_rate_hz
+    if loaded.axis:
+        yield from coupled_feedback_problems(loaded.coupling, loaded.axis, config.feedback, rate_hz)
+    else:
         yield from apart_problems(config.apart, [])
+        yield from coupling_problems(loaded.coupling, {"": loaded.model}, rate_hz)
 
 
 def _rest(loaded: LoadedExperiment) -> float:

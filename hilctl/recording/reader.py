@@ -35,7 +35,7 @@ from hilctl.recording.validation import (
     short,
 )
 
-_TEXTS = {"experiment.yaml", "model.yaml", "correction.yaml"}
+_TEXTS = {"experiment.yaml", "model.yaml", "correction.yaml", "coupling.yaml"}
 _NUMBER_BYTES = 8
 _EVENT_BYTES = 2048  # Python objects per message
 
@@ -202,6 +202,7 @@ class RecordingBuilder:
             "experiment_yaml": self._texts.get("experiment.yaml", ""),
             "model_yaml": self._texts.get("model.yaml", ""),
             "correction_yaml": self._texts.get("correction.yaml", ""),
+            "coupling_yaml": self._texts.get("coupling.yaml", ""),
             "device_files": {
                 name.removeprefix(DEVICE_FILES): text
                 for name, text in self._texts.items()

@@ -68,6 +68,7 @@ class Recording:
         model_yaml: The compensator's model, or empty.
         starts: Possible starts of a replay.
         correction_yaml: The learned correction that was added to the reference, or empty.
+        coupling_yaml: The coupling whose crosstalk was removed from the reference, or empty.
         device_files: YAML texts by name: ``profile.yaml`` and ``reader_profile.yaml``.
         aux_channels: Auxiliary channels, in the order of ``samples.aux``.
     """
@@ -87,6 +88,7 @@ class Recording:
     model_yaml: str
     starts: tuple[ReplayStart, ...] = ()
     correction_yaml: str = ""
+    coupling_yaml: str = ""
     labels: Mapping[str, LabelValue] = field(default_factory=dict)
     device_files: Mapping[str, str] = field(default_factory=dict)
     aux_channels: tuple[AuxChannel, ...] = ()

@@ -44,6 +44,7 @@ class RunFacts:
     model_yaml: str
     layout: RecordingLayout
     correction_yaml: str = ""
+    coupling_yaml: str = ""
     device_files: Mapping[str, str] = field(default_factory=dict)
 
 
@@ -66,6 +67,7 @@ class RecordingWriter:
         texts = {"experiment.yaml": run.experiment_yaml}
         texts |= {"model.yaml": run.model_yaml} if run.model_yaml else {}
         texts |= {"correction.yaml": run.correction_yaml} if run.correction_yaml else {}
+        texts |= {"coupling.yaml": run.coupling_yaml} if run.coupling_yaml else {}
         texts |= {f"{DEVICE_FILES}{name}": text for name, text in run.device_files.items()}
         for name, text in texts.items():
             times = start_unix_ns, start_unix_ns

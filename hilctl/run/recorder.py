@@ -27,6 +27,7 @@ from hilctl.base.samples import BlockBatch, BlockHeader, Samples
 from hilctl.experiment.coil_heat import CoilHeat
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
 from hilctl.experiment.sections.correction import dump_correction
+from hilctl.experiment.sections.coupling import dump_coupling
 from hilctl.experiment.state_files import CoilState, DeviceState, MachineTime, names_of, write_state
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.machine.procfs import ProcessUsage
@@ -290,7 +291,8 @@ class Recorder:
         model_yaml = dump_model(loaded.model) if loaded.model else ""
         correction_yaml = dump_correction(loaded.correction) if loaded.correction else ""
         started = iso_time(start_unix_ns)
-        texts = started, model_yaml, correction_yaml
+        coupling_yaml = dump_coupling(loaded.coupling) if loaded.coupling else ""
+        texts = started, model_yaml, correction_yaml, coupling_yaml
         facts = run_facts(self._checked, *texts, run_id=self._run_id, axes=self._axes)
         return RunFacts(
             facts={**facts, **set_up},
@@ -298,6 +300,7 @@ class Recorder:
             experiment_yaml=loaded.yaml_text,
             model_yaml=model_yaml,
             correction_yaml=correction_yaml,
+            coupling_yaml=coupling_yaml,
             device_files=info.files,
             layout=RecordingLayout(
                 sample_rate_hz=config.sample_rate_hz,

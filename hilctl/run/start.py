@@ -28,6 +28,7 @@ from hilctl.base.subprocesses import python_command
 from hilctl.experiment.load import LoadedExperiment, input_files, load_axes, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun, check, check_axes
 from hilctl.experiment.sections.correction import dump_correction
+from hilctl.experiment.sections.coupling import dump_coupling
 from hilctl.machine.reserve import RESERVE
 from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends
@@ -162,24 +163,26 @@ def unpaced(
 
 @dataclass(frozen=True, slots=True)
 class RunKey:
-    """SHA-256 of a run's experiment, model and correction; the latter are empty without one."""
+    """SHA-256 of a run's experiment, model, correction and coupling; empty without one."""
 
     experiment: str
     model: str = ""
     correction: str = ""
+    coupling: str = ""
 
     @classmethod
     def of(cls, loaded: LoadedExperiment) -> Self:
         """Return the key of an experiment."""
         model = dump_model(loaded.model) if loaded.model else ""
         correction = dump_correction(loaded.correction) if loaded.correction else ""
-        return cls(experiment_sha256(loaded), sha256_of(model), sha256_of(correction))
+        coupling = dump_coupling(loaded.coupling) if loaded.coupling else ""
+        return cls(experiment_sha256(loaded), *map(sha256_of, (model, correction, coupling)))
 
     @classmethod
     def of_facts(cls, run: Mapping[str, str]) -> Self:
         """Return the key of a recorded run from its metadata."""
-        names = ("experiment_sha256", "model_sha256", "correction_sha256")
-        return cls(*(run.get(name, "") for name in names))
+        kinds = ("experiment", "model", "correction", "coupling")
+        return cls(*(run.get(f"{kind}_sha256", "") for kind in kinds))
 
 
 def completed_key(path: Path) -> RunKey | None:

@@ -240,6 +240,8 @@ def _model(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "compensator", f"inverse of a model of kind {kind}"
     if recording.correction_yaml:
         yield "correction", "learned, added to the reference"
+    if recording.coupling_yaml:
+        yield "coupling", "crosstalk of the other axes, removed from the reference"
     try:
         model = parse_model(f"{recording.path}: model.yaml", recording.model_yaml)
     except ConfigError:  # of another version

@@ -23,7 +23,6 @@ from typing import Annotated, Any, Literal, Self
 import numpy as np
 from pydantic import AfterValidator, Field, TypeAdapter, ValidationError
 
-from hilctl.base.axes import names_text
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import MARK, Event
 from hilctl.base.formatting import did_you_mean
