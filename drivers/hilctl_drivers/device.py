@@ -154,6 +154,17 @@ class DacDevice(ABC):
         A block is rejected before anything is sent if its size differs from the one at open, or a
         command is out of range or not finite.
         """
+        self._check_blocks(command, displacement_um, measured)
+        try:
+            self._exchange(first_sample, command, displacement_um, measured)
+            if self._aux_readers:
+                self._read_aux()
+        except DeviceError as error:
+            raise self._failed(self._action, error, self._abandon) from None
+        self._correct(displacement_um)
+
+    def _check_blocks(self, command: F64, displacement_um: F64, measured: F64) -> None:
+        """Raise DeviceError for a block of another size, or a command out of range."""
         block = self._block
         if not command.size == displacement_um.size == measured.size == block or not block:
             self._check_sizes(command, displacement_um, measured)
@@ -163,12 +174,9 @@ class DacDevice(ABC):
         for value in ends:
             if not low <= value <= high:
                 raise self._out_of_range(command)
-        try:
-            self._exchange(first_sample, command, displacement_um, measured)
-            if self._aux_readers:
-                self._read_aux()
-        except DeviceError as error:
-            raise self._failed(self._action, error, self._abandon) from None
+
+    def _correct(self, displacement_um: F64) -> None:
+        """Apply the calibration of the sensor."""
         if self._curve is not None:
             # A reading out of range becomes an end of the corrected range, which is invalid.
             self.reading_um = displacement_um.copy()

@@ -5,10 +5,12 @@ import re
 from collections.abc import Iterable, Iterator, Mapping
 from datetime import date
 from itertools import combinations
+from typing import Any
 
 from hilctl.base.axes import names_text
 from hilctl.base.device import AuxChannel, Device, DeviceInfo
 from hilctl.base.errors import ConfigProblem, DeviceError, broken
+from hilctl.base.formatting import did_you_mean
 from hilctl.experiment.rig import RunRig
 
 _YEAR_DAYS = 366
@@ -94,6 +96,21 @@ def channel_problems(channels: Iterable[AuxChannel]) -> Iterator[ConfigProblem]:
             hint = "end it with the unit, such as coil_c"
             yield broken(f"device.aux.{channel.name}", rule, hint=hint)
         seen.add(channel.name)
+
+
+def crosstalk_problems(
+    options: Mapping[str, Mapping[str, Any]],
+) -> Iterator[tuple[str, ConfigProblem]]:
+    """Yield the crosstalk of simulated devices that names no other axis, with its axis.
+
+    ``options`` are the device sections by axis.
+    """
+    for axis, own in options.items():
+        others = options.keys() - {axis}
+        for name in own.get("crosstalk", {}):
+            if name not in others:
+                rule, hint = "must name another axis", did_you_mean(name, others)
+                yield axis, broken(f"device.crosstalk.{name}", rule, name, hint)
 
 
 def output_problems(axes: Mapping[str, DeviceInfo]) -> Iterator[tuple[str, ConfigProblem]]:

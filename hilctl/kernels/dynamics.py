@@ -220,6 +220,21 @@ def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
         out[k] = parameters[8] * position + parameters[9] * velocity + parameters[10] * now
 
 
+def mode_motion(natural_hz: float, damping_ratio: float, sample_rate_hz: float) -> F64:
+    """Return the motion parameters of :func:`mode_block`, the first eight: float64[2, 4].
+
+    Velocity is in um per radian of the natural frequency, so that the matrix is well scaled.
+    """
+    rates = np.zeros((4, 4))  # position, velocity, x, its change over the step
+    rates[0, 1] = 1.0
+    rates[1, :3] = (-1.0, -2.0 * damping_ratio, 1.0)
+    step_s = 1.0 / sample_rate_hz
+    rates[2, 3] = 1.0 / (2.0 * math.pi * natural_hz * step_s)
+    motion: F64 = np.ascontiguousarray(exponential(rates / rates[2, 3])[:2])
+    motion[:, 2] -= motion[:, 3]
+    return motion
+
+
 @kernel()
 def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Run the exact inverse of :func:`mode_block`."""

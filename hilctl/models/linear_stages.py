@@ -13,8 +13,8 @@ from hilctl.kernels.dynamics import (
     between_block,
     creep_block,
     delay_block,
-    exponential,
     mode_block,
+    mode_motion,
     uncreep_block,
     unmode_block,
 )
@@ -184,21 +184,14 @@ class FirstMode(StrictModel):
         return 0.5 / (math.pi * self.natural_hz)
 
     def motion(self, sample_rate_hz: float) -> F64:
-        """Return motion parameters of :func:`~hilctl.kernels.dynamics.mode_block`: float64[2, 4].
+        """Return :func:`~hilctl.kernels.dynamics.mode_motion`: float64[2, 4].
 
-        Velocity is in um per radian of the natural frequency, so that the matrix is well scaled.
         Raise ModelError if the natural frequency is too low for the sample rate.
         """
-        rates = np.zeros((4, 4))  # position, velocity, x, its change over the step
-        rates[0, 1] = 1.0
-        rates[1, :3] = (-1.0, -2.0 * self.damping_ratio, 1.0)
         step_s = 1.0 / sample_rate_hz
-        rates[2, 3] = 1.0 / (2.0 * math.pi * self.natural_hz * step_s)
-        if not rates[2, 3] < _SLOWEST:
+        if not 2.0 * math.pi * self.natural_hz * step_s > 1.0 / _SLOWEST:
             raise ModelError(f"natural_hz is too low for a step of {step_s:g} s: {self.natural_hz}")
-        motion: F64 = np.ascontiguousarray(exponential(rates / rates[2, 3])[:2])
-        motion[:, 2] -= motion[:, 3]
-        return motion
+        return mode_motion(self.natural_hz, self.damping_ratio, sample_rate_hz)
 
 
 def second_order(frequency_hz: F64, natural_hz: float, damping_ratio: float) -> C128:

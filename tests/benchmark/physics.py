@@ -30,7 +30,7 @@ from hilctl.models.base import HysteresisModel, stroke_class
 from hilctl.models.model_file import load_model
 from hilctl.signals.cycle_metrics import expected_maximum
 from hilctl_drivers.simulated.actuator_base import Plant
-from hilctl_drivers.simulated.devices import SimulatedDevice
+from hilctl_drivers.simulated.simulated_device import SimulatedDevice
 from tests.benchmark.references import GOALS, RATE_HZ, Row, Stroke, references
 from tests.rigs import register
 

@@ -46,7 +46,7 @@ def simulated(kind):
     chosen = device_class(kind)
     device = chosen(chosen.Options())
     return DrivenDevice(
-        device, SAMPLES, RATE_HZ, lambda: device._last_command, name=kind, starts_at_rest=True
+        device, SAMPLES, RATE_HZ, lambda: device.last_command, name=kind, starts_at_rest=True
     )
 
 

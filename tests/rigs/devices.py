@@ -3,13 +3,9 @@
 from typing import ClassVar
 
 from hilctl.base.strict import Field
-from hilctl_drivers.simulated.devices import (
-    SimulatedDevice,
-    SimulatedOptions,
-    SimulatedTerfenol,
-    TerfenolOptions,
-)
+from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
+from hilctl_drivers.simulated.simulated_device import SimulatedDevice, SimulatedOptions
 from tests.rigs.diffusion import DiffusionParameters
 from tests.rigs.domains import DomainsParameters
 from tests.rigs.jiles_atherton import GrowingLagParameters, JilesAthertonParameters

@@ -27,7 +27,7 @@ def make():
         device = chosen(chosen.Options())
         made.append(device)
         return DrivenDevice(
-            device, SAMPLES, RATE_HZ, lambda: device._last_command, starts_at_rest=True
+            device, SAMPLES, RATE_HZ, lambda: device.last_command, starts_at_rest=True
         )
 
     yield of

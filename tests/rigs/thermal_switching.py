@@ -122,7 +122,10 @@ class SwitchingActuator(Plant):
     ) -> None:
         """Build the stack at rest: long at 0 V."""
         self._substeps = math.ceil(1.0 / (sample_rate_hz * parameters.step_max_s) - 1e-9)
-        super().__init__(parameters.sensor_noise_um, seed, max(1, CHUNK // self._substeps))
+        range_um = parameters.sensor_range_um
+        sensor = range_um / parameters.adc_codes, range_um
+        chunk = max(1, CHUNK // self._substeps)
+        super().__init__(parameters.sensor_noise_um, seed, sensor, chunk)
         step_s = 1.0 / (sample_rate_hz * self._substeps)
         bandwidth = 2.0 * math.pi * parameters.amplifier_bandwidth_hz
         ensure_compiled(_switch, respond)
@@ -133,8 +136,6 @@ class SwitchingActuator(Plant):
             parameters.slope_um_per_v,
             parameters.thermal_v,
         )
-        range_um = parameters.sensor_range_um
-        self._sensor = (range_um / parameters.adc_codes, range_um)
         self._equilibrium = parameters.domains(step_s)
         self._domains = self._equilibrium.copy()
         self._rest_um = float(self._equilibrium[2] @ self._equilibrium[3])
@@ -149,10 +150,10 @@ class SwitchingActuator(Plant):
         self._mechanics[:] = 0.0
         self._domains[:] = self._equilibrium
 
-    def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
+    def _advance(self, command: F64, noise_um: F64, signal_um: F64, measured: F64) -> None:
         free_um = np.empty(command.size * self._substeps)
         _switch(
             command, measured, free_um, self._drive, self._domains, self._constants, self._substeps
         )
-        fixed = self._mechanics, self._motion, self._rest_um, self._sensor, self._substeps
-        respond(free_um, noise_um, displacement_um, *fixed)
+        fixed = self._mechanics, self._motion, self._rest_um, self._substeps
+        respond(free_um, signal_um, *fixed)

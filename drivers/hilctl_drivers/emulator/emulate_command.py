@@ -34,7 +34,7 @@ from hilctl_drivers.emulator.rig import ACTUATORS
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import NamedProfile, shipped_profiles
 from hilctl_drivers.signal_chain import AddressOptions, DacOptions
-from hilctl_drivers.simulated.devices import SimulatedOptions
+from hilctl_drivers.simulated.simulated_device import SimulatedOptions
 
 _UNPRIVILEGED = 1024
 _HERE = ("127.0.0.1", "::1", "localhost")

@@ -35,10 +35,10 @@ from hilctl_drivers.sensor_stream.stream_profile import StreamProfile
 from hilctl_drivers.simulated.devices import (
     PiezoOptions,
     PiezoStage,
-    SimulatedDevice,
     SimulatedTerfenol,
     TerfenolOptions,
 )
+from hilctl_drivers.simulated.simulated_device import SimulatedDevice
 
 AnyDevice: TypeAlias = EmulatedModbus | EmulatedText | EmulatedBoard | EmulatedStream
 _DRIVE_V, _RANGE_UM = 100.0, 50.0  # of a piezo stage if no wiring is given

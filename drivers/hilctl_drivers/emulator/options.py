@@ -8,7 +8,8 @@ from typing import Literal, TypeAlias, cast, get_args
 
 from hilctl.base.errors import InputError
 from hilctl_drivers.signal_chain import Amplifier, Sensor
-from hilctl_drivers.simulated.devices import SimulatedOptions, TerfenolOptions
+from hilctl_drivers.simulated.devices import TerfenolOptions
+from hilctl_drivers.simulated.simulated_device import SimulatedOptions
 
 LinkKind: TypeAlias = Literal["tcp", "rtu", "rtu_tcp"]
 """A TCP port, a pty, or a TCP port with frames of Modbus RTU."""

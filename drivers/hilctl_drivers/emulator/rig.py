@@ -16,7 +16,8 @@ from hilctl.base.types import F64, CommandUnit
 from hilctl_drivers.profile_base import BaseProfile, Range
 from hilctl_drivers.signal_chain import Amplifier, Sensor, SignalChain
 from hilctl_drivers.simulated.actuator_base import Plant
-from hilctl_drivers.simulated.devices import SimulatedDevice, SimulatedPiezo, SimulatedTerfenol
+from hilctl_drivers.simulated.devices import SimulatedPiezo, SimulatedTerfenol
+from hilctl_drivers.simulated.simulated_device import SimulatedDevice
 
 RATE_HZ = 10_000.0
 SETTLED_S = 1.0  # the slowest part of the rig has a time constant of 0.1 ms

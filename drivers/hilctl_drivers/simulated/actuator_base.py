@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilctl.base.types import F64
+from hilctl.kernels.jit import kernel
 
 CHUNK = 4096  # samples per kernel call; bounds the scratch memory
 _DRAWN = 256
@@ -42,6 +43,17 @@ class SensorNoise:
         new *= self._std_um
 
 
+@kernel()
+def read_sensor(
+    signal_um: F64, noise_um: F64, displacement_um: F64, sensor: tuple[float, float]
+) -> None:
+    """Fill ``displacement_um`` with readings; ``sensor`` is one ADC code and the range, in um."""
+    adc_code, sensor_range = sensor
+    for j in range(signal_um.size):
+        reading = np.rint((signal_um[j] + noise_um[j]) / adc_code) * adc_code
+        displacement_um[j] = min(sensor_range, max(-sensor_range, reading))
+
+
 class Plant(ABC):
     """A simulated actuator with its amplifier and sensor, advanced sample by sample.
 
@@ -50,11 +62,18 @@ class Plant(ABC):
     same bits for any division into blocks.
     """
 
-    def __init__(self, noise_um: float, seed: int, chunk: int = CHUNK) -> None:
-        """Create the noise, rms; a kernel call takes up to ``chunk`` samples, at most ``CHUNK``."""
+    def __init__(
+        self, noise_um: float, seed: int, sensor: tuple[float, float], chunk: int = CHUNK
+    ) -> None:
+        """Create the sensor: noise, rms, one ADC code and the range, in um.
+
+        A kernel call takes up to ``chunk`` samples, at most ``CHUNK``.
+        """
         self._noise = SensorNoise(noise_um, seed)
-        self._chunk = chunk
-        self._arrays = np.empty((3, chunk))
+        self._drawn = np.empty(0)  # noise of the samples that are not read yet
+        self._sensor = sensor
+        self.chunk = chunk
+        self._arrays = np.empty((4, chunk))
         self._block = tuple(self._arrays)
 
     def reset(self) -> None:
@@ -70,19 +89,30 @@ class Plant(ABC):
             displacement_um: float64[n], filled with the displacement from rest.
             measured: float64[n], filled with the command as it was at each reading.
         """
-        samples = command.size
-        if samples > self._chunk:
-            for start in range(0, samples, self._chunk):
-                part = slice(start, start + self._chunk)
-                self.step(command[part], displacement_um[part], measured[part])
-            return
+        for start in range(0, command.size, self.chunk):
+            part = slice(start, start + self.chunk)
+            self.read(self.sense(command[part], measured[part]), displacement_um[part])
+
+    def sense(self, command: F64, measured: F64) -> F64:
+        """Do :meth:`step` for one chunk without the readings, which :meth:`read` takes.
+
+        Return the sensor's signal in um, float64[n], without noise; valid until the next call.
+        """
         # Copies: kernels take contiguous arrays only.
-        held, read_um, read = self._block
-        if held.size != samples:  # the views are kept: blocks usually have one length
-            self._block = held, read_um, read = tuple(self._arrays[:, :samples])
+        held, signal_um, _, driven = self._block
+        if held.size != command.size:  # the views are kept: blocks usually have one length
+            self._block = held, signal_um, _, driven = tuple(self._arrays[:, : command.size])
         held[:] = command
-        self._advance(held, self._noise.draw(samples), read_um, read)
-        displacement_um[:], measured[:] = read_um, read
+        self._drawn = self._noise.draw(command.size)
+        self._advance(held, self._drawn, signal_um, driven)
+        measured[:] = driven
+        return signal_um
+
+    def read(self, signal_um: F64, displacement_um: F64) -> None:
+        """Read the signal of the last chunk with its noise, in whole codes within the range."""
+        read_um = self._block[2]
+        read_sensor(signal_um, self._drawn, read_um, self._sensor)
+        displacement_um[:] = read_um
 
     def warm_up(self) -> None:
         """Advance by one sample and return to rest, so that all kernels are compiled."""
@@ -103,8 +133,11 @@ class Plant(ABC):
         """Reset the state to rest."""
 
     @abstractmethod
-    def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
-        """Do :meth:`step` for one chunk with its noise; all arrays are contiguous."""
+    def _advance(self, command: F64, noise_um: F64, signal_um: F64, measured: F64) -> None:
+        """Do :meth:`sense` for one chunk; all arrays are contiguous.
+
+        Growth that passes no structure is added to the noise of its readings.
+        """
 
 
 @dataclass(frozen=True, slots=True)

@@ -46,22 +46,20 @@ class PiezoParameters:
 @kernel()
 def _run(
     command: F64,  # float64[n], drive in V
-    noise_um: F64,  # float64[n], of each reading
-    displacement_um: F64,  # float64[n], filled with the sensor's readings
+    signal_um: F64,  # float64[n], filled with the sensor's signal at each reading
     drive_v: F64,  # float64[n], filled with the drive at the instant of each reading
     state: F64,  # float64[2]: drive in V, sensor output in um; updated
     plays: F64_2D,  # float64[3, m]: threshold, weight and output of each play operator; updated
-    constants: tuple[float, float, float, float, float, float],
+    constants: tuple[float, float, float, float],
 ) -> None:
-    """Read the sensor, output the command and advance one sample period; for every sample."""
+    """Note the sensor's signal, output the command and advance one period; for every sample."""
     # Weight of the drive, remaining part of the sensor's error after a sample period, a DAC code in
-    # V, an ADC code in um, the sensor's range and the position at rest in um.
-    slope, left, dac_code, adc_code, sensor_range, offset = constants
+    # V, and the position at rest in um.
+    slope, left, dac_code, offset = constants
     drive = state[0]
     sensor = state[1]
     for j in range(command.size):
-        reading = np.rint((sensor + noise_um[j]) / adc_code) * adc_code
-        displacement_um[j] = min(sensor_range, max(-sensor_range, reading))
+        signal_um[j] = sensor
         drive_v[j] = drive
         drive = np.rint(command[j] / dac_code) * dac_code
         position = offset + slope * drive
@@ -79,7 +77,9 @@ class PiezoActuator(Plant):
 
     def __init__(self, parameters: PiezoParameters, sample_rate_hz: float, seed: int = 1) -> None:
         """Build the stage at rest: at its offset at 0 V, never driven before."""
-        super().__init__(parameters.sensor_noise_um, seed)
+        range_um = parameters.sensor_range_um
+        sensor = range_um / parameters.adc_codes, range_um
+        super().__init__(parameters.sensor_noise_um, seed, sensor)
         thresholds = np.array(parameters.thresholds_v, dtype=np.float64)
         weights = np.array(parameters.weights_um_per_v, dtype=np.float64)
         self._plays = np.stack([thresholds, weights, np.zeros_like(weights)])
@@ -87,8 +87,6 @@ class PiezoActuator(Plant):
             parameters.slope_um_per_v,
             math.exp(-2.0 * math.pi * parameters.sensor_bandwidth_hz / sample_rate_hz),
             parameters.drive_max_v / parameters.dac_codes,
-            parameters.sensor_range_um / parameters.adc_codes,
-            parameters.sensor_range_um,
             parameters.offset_um,
         )
         self._state = np.zeros(2)
@@ -98,7 +96,5 @@ class PiezoActuator(Plant):
         self._state[:] = (0.0, self._constants[-1])
         self._plays[2] = 0.0
 
-    def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
-        _run(
-            command, noise_um, displacement_um, measured, self._state, self._plays, self._constants
-        )
+    def _advance(self, command: F64, noise_um: F64, signal_um: F64, measured: F64) -> None:
+        _run(command, signal_um, measured, self._state, self._plays, self._constants)

@@ -37,23 +37,19 @@ def motion(modes: Sequence[Mode], sensor_bandwidth_hz: float, step_s: float) -> 
 @kernel()
 def respond(
     free_um: F64,  # float64[n substeps], displacement of the rods at the end of each step
-    noise_um: F64,  # float64[n], of each reading
-    displacement_um: F64,  # float64[n], filled with the sensor's readings
+    signal_um: F64,  # float64[n], filled with the sensor's signal at each reading
     mechanics: F64,  # float64[m], updated
     motion: F64_2D,  # float64[m - 2, m], exact step for a free displacement that changes linearly
     rest_um: float,  # free displacement at rest
-    sensor: tuple[float, float],  # one ADC code and the range, in um
     substeps: int,  # in a sample period
 ) -> None:
-    """Read the sensor, then let structure and sensor follow the rods; for every sample."""
+    """Note the sensor's signal, then let structure and sensor follow the rods; for every sample."""
     # mechanics: position and velocity of each mode, sensor output, free displacement from rest
     # before and after the last step.
-    adc_code, sensor_range = sensor
     size = mechanics.size
     moved = np.empty(size - 2)
-    for j in range(noise_um.size):
-        reading = np.rint((mechanics[size - 3] + noise_um[j]) / adc_code) * adc_code
-        displacement_um[j] = min(sensor_range, max(-sensor_range, reading))
+    for j in range(signal_um.size):
+        signal_um[j] = mechanics[size - 3]
         for k in range(j * substeps, (j + 1) * substeps):
             mechanics[size - 2] = mechanics[size - 1]
             mechanics[size - 1] = free_um[k] - rest_um

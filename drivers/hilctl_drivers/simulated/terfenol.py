@@ -252,14 +252,14 @@ class TerfenolActuator(Plant):
         self._substeps = math.ceil(1.0 / (sample_rate_hz * parameters.step_max_s) - 1e-9)
         # At a low rate one sample period has many steps: a chunk is then fewer samples.
         chunk = max(1, CHUNK // self._substeps)
-        super().__init__(parameters.sensor_noise_um, seed, chunk)
+        range_um = parameters.sensor_range_um
+        sensor = range_um / parameters.dac_codes, range_um
+        super().__init__(parameters.sensor_noise_um, seed, sensor, chunk)
         step_s = 1.0 / (sample_rate_hz * self._substeps)
         self._amplifier = _amplifier(parameters, step_s)
         ensure_compiled(amplify, respond)
         bias = parameters.magnet_field_a_per_m + parameters.coil_factor_per_m * bias_a
         self._rods = parameters.rods.rods(Coil(parameters.coil_factor_per_m, bias, step_s))
-        range_um = parameters.sensor_range_um
-        self._sensor = (range_um / parameters.dac_codes, range_um)
         self._drift = (parameters.drift_um, 1.0 / (parameters.drift_s * sample_rate_hz))
         self._samples = 0
         self._creep = _creep(parameters.creep, step_s)
@@ -291,7 +291,7 @@ class TerfenolActuator(Plant):
         self._rest_um = self._rods.rest()
         self._samples = 0
 
-    def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
+    def _advance(self, command: F64, noise_um: F64, signal_um: F64, measured: F64) -> None:
         """Pass samples through amplifier, rods and structure in turn.
 
         The rods have no effect on the amplifier, nor the structure on the rods, so each can process
@@ -312,5 +312,4 @@ class TerfenolActuator(Plant):
             creep(free, self._creep, self._rest_um)
         if self._thermal is not None:
             warm(halves, noise_um, self._warmth, self._thermal, self._substeps)
-        fixed = self._mechanics, self._motion, self._rest_um, self._sensor, self._substeps
-        respond(free, noise_um, displacement_um, *fixed)
+        respond(free, signal_um, self._mechanics, self._motion, self._rest_um, self._substeps)

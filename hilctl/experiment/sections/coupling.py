@@ -16,12 +16,12 @@ from typing import Annotated, Self
 
 import numpy as np
 
+from hilctl.base.axes import names_text
 from hilctl.base.errors import ConfigProblem, broken
 from hilctl.base.files import TextFiles, write_text
 from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import F64
 from hilctl.base.yaml import commented, load_document
-from hilctl.experiment.axes import names_text
 from hilctl.experiment.sections.feedback import (
     AnyFeedbackConfig,
     PiFeedbackConfig,

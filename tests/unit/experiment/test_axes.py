@@ -225,3 +225,12 @@ def test_real_axes_are_refused_together_and_run_alone(tmp_path):
     (problem,) = refused(own)
     assert (problem.where, problem.key) == (f"{own}:10", "device")
     assert load_experiment(own, ["axis=x"]).config == load_experiment(path).config
+
+
+@pytest.mark.parametrize("named", ["z", "x"])
+def test_crosstalk_names_another_axis(stage, named):
+    crosstalk = f"device: {{seed: 1, crosstalk: {{{named}: {{gain: 0.04}}}}}}"
+    (problem,) = refused(stage("device: {seed: 1}", crosstalk))
+    assert problem.key == f"device.crosstalk.{named}"
+    assert problem.where.endswith("stage.yaml:10, x")
+    assert "y" in problem.hint

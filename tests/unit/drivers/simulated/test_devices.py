@@ -7,11 +7,11 @@ from pydantic import ValidationError
 from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.simulated.devices import (
     PiezoOptions,
-    SimulatedFault,
     SimulatedPiezo,
     SimulatedTerfenol,
     TerfenolOptions,
 )
+from hilctl_drivers.simulated.simulated_device import SimulatedFault
 from tests.unit.base.test_calibration import AMPLIFIER, CALIBRATION
 
 RATE_HZ = 50e3
@@ -197,7 +197,7 @@ class TestFaults:
             with pytest.raises(DeviceError, match=words):
                 send(device, first_sample, np.zeros(BLOCK))
         device.make_safe(1.0)
-        assert device._last_command == 1.0
+        assert device.last_command == 1.0
 
 
 @pytest.fixture
