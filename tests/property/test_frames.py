@@ -20,7 +20,8 @@ from pymodbus.pdu.register_message import (
     WriteMultipleRegistersResponse,
 )
 
-from hilctl_drivers.ascii.ascii_session import LineFormat, parse_number
+from hilctl_drivers.ascii.ascii_session import LineFormat
+from hilctl_drivers.ascii.number_format import parse_number
 from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import (
     feedback_pdu,

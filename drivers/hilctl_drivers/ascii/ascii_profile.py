@@ -19,12 +19,12 @@ from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from functools import cache
 from string import Formatter
-from typing import Annotated, ClassVar, Literal, Self, TypeAlias, cast, get_args
+from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
-from pydantic import AfterValidator, Field, StringConstraints, model_validator
+from pydantic import AfterValidator, Field, model_validator
 
 from hilctl.base.strict import StrictModel
-from hilctl_drivers.modbus.register_map import RegisterFormat, RegisterType
+from hilctl_drivers.ascii.number_format import NumberFormat, as_text, number_format
 from hilctl_drivers.profile_base import (
     BaseProfile,
     BinaryLineSettings,
@@ -38,58 +38,44 @@ from hilctl_drivers.profile_base import (
     parts_of,
 )
 from hilctl_drivers.transport.crc import CrcName
-from hilctl_drivers.transport.links import BadRequestError
+from hilctl_drivers.transport.links import BadRequestError, CorruptError
 
 SAMPLES = {"value": 0.0, "safe": 0.0, "address": 1, "timeout": 1}
 """The fields of templates, with a value for each."""
-_BINARY = re.compile(rf"({'|'.join(get_args(RegisterType))})(?: ([A-H]+))?")
-_BINARY_FIELD = re.compile(r"\{value:([^{}]*)\}")
-
-
-@cache
-def binary_format(spec: str) -> RegisterFormat | None:
-    """Return the type of a field of bytes, None for text; raise ValueError for a wrong order."""
-    found = _BINARY.fullmatch(spec)
-    return RegisterFormat(cast("RegisterType", found[1]), found[2] or "") if found else None
+_FIELD = re.compile(r"\{value(?::([^{}]*))?\}")
 
 
 @dataclass(frozen=True, slots=True)
 class _Field:
-    """A number that may be formatted as its bytes in hexadecimal, see :func:`binary_format`."""
+    """A number that formats itself as in :func:`number_format`."""
 
     number: float
 
     def __format__(self, spec: str) -> str:
-        binary = binary_format(spec)
-        return format(self.number, spec) if binary is None else as_text(binary.encode(self.number))
-
-
-def as_text(data: bytes) -> str:
-    """Return bytes as they are written in profiles."""
-    return data.hex(" ").upper()
+        return number_format(spec).text(self.number)
 
 
 def fill(template: str, **values: float) -> str:
-    """Fill in the fields of a template; raise BadRequestError if a type cannot hold its value."""
+    """Fill in the fields of a template; raise BadRequestError if a format cannot hold its value."""
     return template.format(**{name: _Field(number) for name, number in values.items()})
 
 
 @cache
-def pattern_of(text: str) -> tuple[re.Pattern[str], RegisterFormat | None]:
-    """Return a pattern as a regular expression, and the type of its number if that is bytes."""
-    field = _BINARY_FIELD.search(text)
+def pattern_of(text: str) -> tuple[re.Pattern[str], NumberFormat]:
+    """Return a pattern as a regular expression, and the format of its number."""
+    field = _FIELD.search(text)
     if field is None:
-        return re.compile(text, re.ASCII), None
-    binary = binary_format(field[1])
-    if binary is None:
-        known = ", ".join(get_args(RegisterType))
-        raise ValueError(f"{field[0]} must have a type of {known}, and may have an order")
-    group = rf"([0-9A-F]{{2}}(?: [0-9A-F]{{2}}){{{binary.size - 1}}})"
-    return re.compile(text.replace(field[0], group, 1), re.ASCII), binary
+        return re.compile(text, re.ASCII), number_format("")
+    form = number_format(field[1] or "")
+    return re.compile(text.replace(field[0], f"({form.regex})", 1), re.ASCII), form
 
 
 def _check_template(text: str) -> str:
-    for _, field, form, conversion in Formatter().parse(text):
+    try:
+        parts = [*Formatter().parse(text)]
+    except ValueError:
+        raise ValueError("must have { and } around fields only, doubled elsewhere") from None
+    for _, field, form, conversion in parts:
         if field is not None and (field not in SAMPLES or conversion or "{" in (form or "")):
             known = ", ".join(f"{{{name}}}" for name in SAMPLES)
             raise ValueError(f"fields must be of {known}")
@@ -107,10 +93,8 @@ def _check_pattern(text: str) -> str:
     return text
 
 
-LineTemplate: TypeAlias = Annotated[
-    str, StringConstraints(min_length=1), AfterValidator(_check_template)
-]
-Pattern: TypeAlias = Annotated[str, StringConstraints(min_length=1), AfterValidator(_check_pattern)]
+LineTemplate: TypeAlias = Annotated[str, AfterValidator(_check_template)]
+Pattern: TypeAlias = Annotated[str, AfterValidator(_check_pattern)]
 
 
 def fields_of(template: str) -> set[str]:
@@ -216,18 +200,15 @@ class NumberReply(Reply):
         match = self.match(self.example)
         if match is None or match.re.groups != 1:
             raise ValueError(f"pattern '{self.pattern}' must have one group, around the number")
-        if self.binary is not None:
-            return self
         try:
-            float(match[1])
-        except ValueError:
+            self.number_in(match)
+        except CorruptError:
             raise ValueError(f"the group must hold a number, got {match[1]!r}") from None
         return self
 
-    @property
-    def binary(self) -> RegisterFormat | None:
-        """Type of a number in bytes; None for one in text."""
-        return pattern_of(self.pattern)[1]
+    def number_in(self, match: re.Match[str]) -> float:
+        """Return the number in a match; NaN if the device sent it."""
+        return pattern_of(self.pattern)[1].number(match[1])
 
 
 class MeasuredReply(NumberReply):
@@ -311,13 +292,14 @@ class AsciiOutput(ScaledRange):
                 raise ValueError(f"{key} must hold min and max, got {value}: {error}") from None
         specs = [spec or "" for _, name, spec, _ in Formatter().parse(template) if name == field]
         for spec in specs:
-            for part in range(8) if binary_format(spec) is None else ():
+            form = number_format(spec)
+            for part in range(8) if form.mark else ():
                 # Sevenths have no short decimal.
                 number = self.number(self.min + (self.max - self.min) * part / 7.0)
-                sent = format(number, spec)
+                sent = form.text(number)
                 try:
-                    coarse = abs((float(sent) - number) * self.scale) > self.step
-                except ValueError:  # such as 45.7%
+                    coarse = abs((form.number(sent) - number) * self.scale) > self.step
+                except CorruptError:  # such as 45.7%
                     coarse = True
                 if coarse:
                     rule = f"{key} must have the digits of {self.step:g} {self.unit}"

@@ -1,7 +1,7 @@
 """Session with a device of text or frames: messages, checksums, numbers, transmission times.
 
 DCON (ICP DAS, Advantech ADAM): ICP DAS "DCON protocol command set". GEN (TDK-Lambda): "Genesys User
-Manual" 7.5. SCPI: SCPI-1999 volume 1, 7.2.1 for numbers; number forms as in IEEE 488.2, 8.7.
+Manual" 7.5.
 """
 
 import math
@@ -30,11 +30,10 @@ from hilctl_drivers.ascii.ascii_profile import (
     Query,
     Reply,
     SendStep,
-    as_text,
     fill,
 )
+from hilctl_drivers.ascii.number_format import as_text
 from hilctl_drivers.endpoint import Endpoint
-from hilctl_drivers.modbus.register_map import RegisterFormat
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.session import SteppedSession
 from hilctl_drivers.transport.crc import CRCS, Bytes, Crc, dcon_checksum, gen_checksum
@@ -52,14 +51,10 @@ from hilctl_drivers.transport.links import (
 )
 from hilctl_drivers.transport.wire_time import WireTime
 
-_SCPI_INFINITY = 9.9e37
-"""SCPI-1999 uses this for infinity, and 9.91e37 for NaN."""
-
 _ERRORS_MAX = 50
 """Larger than the error queue of a device; a device that reports its state has no queue."""
 _CHECKSUMS = {"none": lambda _text: b"", "dcon": dcon_checksum, "gen": gen_checksum}
 _CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
-_NUMBER = re.compile(r"[+-]?(?:\d+\.?\d*|\.\d+)(?:[eE][+-]?\d{1,4})?", re.ASCII)
 _ADDRESSED = re.compile(r"[!?]([0-9A-F]{2})")
 
 
@@ -193,37 +188,15 @@ def formats(link: AsciiLink | AsciiTcpLink | BytesLink) -> tuple[MessageFormat, 
     )
 
 
-def parse_number(text: str, binary: RegisterFormat | None = None) -> float:
-    """Return the number in a text that is exactly one number; blanks around it are allowed.
-
-    With ``binary`` the text is the number's bytes in hexadecimal; NaN if the device sent it.
-
-    Raises:
-        CorruptError: Anything else, or the SCPI values for infinity and NaN.
-    """
-    if binary is not None:
-        return binary.decode(bytes.fromhex(text))
-    body = text.strip(" ")
-    if not _NUMBER.fullmatch(body):
-        raise CorruptError(f"must be one number, got {text!r}")
-    value = float(body)
-    if abs(value) >= _SCPI_INFINITY:
-        rule = "if it is a reading, set invalid of its input in the profile"
-        raise CorruptError(f"means no measurement: {text!r}; {rule}")
-    return value
-
-
 def reading(form: MeasuredReply, ask: Callable[..., re.Match[str]]) -> float:
     """Return the number in a reply of a form, or NaN if the reply marks the reading as invalid.
 
     ``ask`` takes forms and returns the match of the reply.
     """
     if form.invalid == "none":
-        return parse_number(ask(form)[1], form.binary)
+        return form.number_in(ask(form))
     found = ask(form.invalid, form)
-    if form.invalid.match(found.string):
-        return math.nan
-    return parse_number(found[1], form.binary)
+    return math.nan if form.invalid.match(found.string) else form.number_in(found)
 
 
 class AsciiSession(SteppedSession):
@@ -323,7 +296,7 @@ class AsciiSession(SteppedSession):
 
     def number(self, query: Query) -> float:
         """Ask for a number."""
-        return parse_number(self.query(self.text(query.ask), query)[1], query.binary)
+        return query.number_in(self.query(self.text(query.ask), query))
 
     def value(self, source: AsciiInput) -> float:
         """Ask for the value of an input, in its unit; NaN if the reading is invalid."""

@@ -15,16 +15,14 @@ from hilctl_drivers.ascii.ascii_profile import (
     AsciiExchange,
     AsciiOutput,
     Readback,
-    binary_format,
-    fill,
 )
 from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
     exchange_time,
-    parse_number,
     query_time,
     reading,
 )
+from hilctl_drivers.ascii.number_format import number_format
 from hilctl_drivers.dac_setup import DacSetup
 from hilctl_drivers.session import SensorReader
 from hilctl_drivers.transport.links import Link, WatchdogTrippedError
@@ -229,9 +227,8 @@ class TextWire(Wire):
         if value is None:
             return
         fields = Formatter().parse(self._target.write)
-        spec = next(spec or "" for _, field, spec, _ in fields if field == "value")
-        sent = fill(f"{{value:{spec}}}", value=self._target.number(value))
-        if self._target.value(parse_number(sent, binary_format(spec))) != value:
+        form = number_format(next(spec or "" for _, field, spec, _ in fields if field == "value"))
+        if self._target.value(form.number(form.text(self._target.number(value)))) != value:
             return
 
         def put() -> None:

@@ -13,7 +13,6 @@ from hilctl_drivers.ascii.ascii_profile import (
     NumberStep,
     Reply,
     SendStep,
-    as_text,
     pattern_of,
 )
 from hilctl_drivers.emulator.rig import Bench
@@ -26,20 +25,21 @@ _REFUSED = '-200,"Execution error"'
 
 def in_style(example: str, pattern: str, value: float) -> str:
     """Return a reply like ``example``, with ``value`` where the pattern's group is."""
-    regex, binary = pattern_of(pattern)
+    regex, form = pattern_of(pattern)
     found = regex.fullmatch(example)
     assert found is not None, "a profile's examples match their patterns"
     start, stop = found.span(1)
-    if binary is not None:
-        return example[:start] + as_text(binary.encode(value)) + example[stop:]
     model = example[start:stop]
     sign = "+" if model[0] in "+-" else ""
-    if "E" in model.upper():
-        number = f"{value:{sign}.6E}"
+    if not form.mark:
+        number = form.text(value)
+    elif "E" in model.upper():
+        number = f"{value:{sign}.6E}".replace(".", form.mark)
     else:
-        decimals = len(model.partition(".")[2])
+        decimals = len(model.partition(form.mark)[2])
         value = round(value, decimals) + 0.0  # no device says -0.000
-        number = f"{value:{sign}0{len(model)}.{decimals}f}"
+        pad = " " if " " in model else "0"
+        number = f"{value:{pad}={sign}{len(model)}.{decimals}f}".replace(".", form.mark)
     return example[:start] + number + example[stop:]
 
 

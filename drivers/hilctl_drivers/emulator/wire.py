@@ -4,19 +4,17 @@ import re
 from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
-from functools import partial
 from string import Formatter
 from typing import TypeAlias
 
-from hilctl_drivers.ascii.ascii_profile import SAMPLES, AsciiProfile, as_text, binary_format, fill
-from hilctl_drivers.ascii.ascii_session import FrameFormat, formats, parse_number
+from hilctl_drivers.ascii.ascii_profile import SAMPLES, AsciiProfile, fill
+from hilctl_drivers.ascii.ascii_session import FrameFormat, formats
+from hilctl_drivers.ascii.number_format import as_text, number_format
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
 from hilctl_drivers.emulator.rig import EmulatedDevice
 from hilctl_drivers.transport.crc import Bytes
 from hilctl_drivers.transport.framing import binary_framing, split_sized
 from hilctl_drivers.transport.links import CorruptError
-
-_NUMBER = r"[-+]?[0-9]*\.?[0-9]+(?:[eE][-+]?[0-9]+)?"
 
 
 @dataclass(frozen=True, slots=True)
@@ -104,8 +102,9 @@ class TemplateMatcher:
             if field == "address":
                 parts.append(re.escape(fill(f"{{address:{spec}}}", address=address)))
             elif field is not None:
-                group, self._parse[field] = _field(spec or "")
-                parts.append(f"(?P<{field}>{group})")
+                form = number_format(spec or "")
+                self._parse[field] = form.number
+                parts.append(f"(?P<{field}>{form.regex})")
         self._pattern = re.compile("".join(parts), re.ASCII)
 
     def match(self, text: str) -> dict[str, float] | None:
@@ -114,16 +113,6 @@ class TemplateMatcher:
         if found is None:
             return None
         return {name: self._parse[name](each) for name, each in found.groupdict().items()}
-
-
-def _field(spec: str) -> tuple[str, Callable[[str], float]]:
-    """Return the pattern of a field, and the conversion to its number."""
-    binary = binary_format(spec)
-    if binary is not None:
-        return rf"[0-9A-F ]{{{3 * binary.size - 1}}}", partial(parse_number, binary=binary)
-    if spec.endswith(("X", "x")):
-        return "[0-9A-Fa-f]+", partial(int, base=16)
-    return _NUMBER, float
 
 
 def _frame_size(form: FrameFormat, profile: AsciiProfile) -> Callable[[Bytes], int]:

@@ -13,8 +13,8 @@ from hilctl_drivers.ascii.ascii_session import (
     LineFormat,
     exchange_time,
     formats,
-    parse_number,
 )
+from hilctl_drivers.ascii.number_format import parse_number
 from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.transport import links
 
