@@ -24,6 +24,7 @@ LINK_KINDS = {
     "ascii": "ascii.ascii_profile:AsciiProfile",
     "ascii_tcp": "ascii.ascii_profile:AsciiProfile",
     "bytes": "ascii.ascii_profile:AsciiProfile",
+    "bytes_tcp": "ascii.ascii_profile:AsciiProfile",
     "frames": "board.board_profile:FrameProfile",
     "rtu": "modbus.modbus_profile:ModbusProfile",
     "rtu_tcp": "modbus.modbus_profile:ModbusProfile",

@@ -41,6 +41,7 @@ _PROTOCOLS = {
     "ascii": "lines of text",
     "ascii_tcp": "lines of text over TCP",
     "bytes": "frames of fixed bytes",
+    "bytes_tcp": "frames of fixed bytes over TCP",
     "frames": "binary frames",
     "sensor_stream": "samples sent unasked",
 }

@@ -36,6 +36,8 @@ PIEZO = (
     "thorlabs_kpz101 thorlabs_ksg101 own V",
     "cobs_board V",
     "icp_m7024_dcon agilent_34970a own V",
+    "thorlabs_mdt693b agilent_34970a own V",
+    "attocube_anc300 agilent_34970a own V",
 )
 """Serial devices that drive a piezo too."""
 ONLY_READS = """\
@@ -147,7 +149,8 @@ def wired(case, tmp_path, stack):
     if case.endswith(" V"):
         made.reach = (device.info.command_min, device.info.command_max)
     made.must_be_at_rest = name in MUST_BE_AT_REST
-    made.reads_back = name != "adam_4024_ascii"  # returns its last command, not its output
+    # One returns its last command, not its output; the other measures it too roughly.
+    made.reads_back = name not in {"adam_4024_ascii", "thorlabs_mdt693b"}
     return made
 
 

@@ -63,7 +63,70 @@ turnaround_s: 0.0
 max_rate_hz: 1000.0
 watchdog: none
 """
-OWN = {"gcs": GCS, "frames": FRAMES}
+HEXADECIMAL = """\
+vendor: nobody
+model: a board with hexadecimal numbers, an echo and a prompt
+source: [this test]
+verified: "yes"
+link: {kind: ascii, baud: 115200, terminator: "\\r", reply_terminator: "\\r# ", echo: true}
+address: none
+outputs:
+  DAC:
+    {write: "dac {value:04X}", reply: {pattern: OK, example: OK}, scale: 3.0517578125e-4,
+      offset: -10.0, unit: V, min: -10.0, max: 9.9997,
+      readback: {ask: "dac", pattern: "dac={value:04X}\\nOK", example: "dac=8000\\nOK"}}
+inputs:
+  ADC:
+    {ask: "adc", pattern: "adc={value:int16X}\\nOK", example: "adc=FFFE\\nOK", scale: 0.005,
+      unit: um, min: -125, max: 125}
+exchange: none
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+watchdog: none
+"""
+XOR_FRAMES = """\
+vendor: nobody
+model: a controller with exclusive or inside its frames, over TCP
+source: [this test]
+verified: "yes"
+link:
+  {kind: bytes_tcp, port: 4001, checksum: xor8, checksum_from: 2, checksum_before: 1}
+address: none
+outputs:
+  axis1:
+    {write: "AA 55 01 {value:int32} 0D", reply: {pattern: "AA 55 06 0D", example: "AA 55 06 0D"},
+      scale: 1.0e-6, unit: V, min: -10.0, max: 10.0,
+      readback: {ask: "AA 55 02 0D", pattern: "AA 55 02 {value:int32} 0D",
+        example: "AA 55 02 00 00 00 05 0D"}}
+inputs:
+  position1:
+    {ask: "AA 55 03 0D", pattern: "AA 55 03 {value:float32} 0D",
+      example: "AA 55 03 3F 80 00 00 0D", unit: um, min: -125, max: 125}
+exchange: none
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+watchdog: none
+"""
+COMMA = """\
+vendor: nobody
+model: a gauge with decimal commas, blanks behind signs, and ETX at the end of a reply
+source: [this test]
+verified: "yes"
+link: {kind: ascii, baud: 115200, terminator: ";", reply_terminator: "\\x03"}
+address: none
+outputs: {}
+inputs:
+  gauge:
+    {ask: "R", pattern: "{value:f,} UM", example: "-   1,250 UM", unit: um, min: -125, max: 125}
+exchange: none
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+watchdog: none
+"""
+OWN = {
+    "gcs": GCS, "frames": FRAMES, "hexadecimal": HEXADECIMAL, "xor_frames": XOR_FRAMES,
+    "comma": COMMA,
+}  # fmt: skip
 PAIRS = {
     "text with LabJack": ("kepco_bop", {"reader": "labjack_t7"}),
     "Modbus TCP with text": ("adam_6224", {"reader": "agilent_34970a"}),
@@ -74,6 +137,9 @@ PAIRS = {
     ),
     "board with text over TCP": ("cobs_board", {"reader": "gcs"}),
     "frames of fixed bytes": ("frames", {}),
+    "hexadecimal numbers": ("hexadecimal", {}),
+    "checksum inside frames": ("xor_frames", {}),
+    "frames over TCP with decimal commas": ("xor_frames", {"reader": "comma"}),
     "text with frames": ("kepco_bop", {"reader": "frames"}),
     "Modbus RTU with a board": ("icp_m7024", {"reader": "cobs_board"}),
     "text with a stream": ("kepco_bop", {"reader": "capancdt_6200"}),

@@ -9,8 +9,8 @@ A line feed in a template separates lines that are sent in one write, such as
 ``SVA 1 {value:.4f}\nPOS? 1``. A line feed in an example separates the lines of one reply.
 
 A frame is written as its bytes in hexadecimal, such as ``A0 34 13 83 11 55``. The field
-``{value:int32 DCBA}`` stands for the bytes of a number, in templates and in patterns; type and
-order are those of :mod:`hilctl_drivers.modbus.register_map`. The example shows a reply's length.
+``{value:int32 DCBA}`` stands for the bytes of a number, see
+:mod:`hilctl_drivers.ascii.number_format`. The example shows a reply's length.
 """
 
 import math
@@ -102,6 +102,15 @@ def fields_of(template: str) -> set[str]:
     return {field for _, field, _, _ in Formatter().parse(template) if field}
 
 
+def _check_terminator(text: str) -> str:
+    if not 1 <= len(text) <= 8 or not text.isascii():
+        raise ValueError('must be 1 to 8 ASCII characters, such as "\\r\\n" or "> "')
+    return text
+
+
+Terminator: TypeAlias = Annotated[str, AfterValidator(_check_terminator)]
+
+
 class TextLines(StreamSettings):
     """Lines of text: SCPI, GCS, DCON and the like."""
 
@@ -109,8 +118,11 @@ class TextLines(StreamSettings):
         "terminator", "reply_terminator", "checksum", "bytesize", "echo",
     )  # fmt: skip
 
-    terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of a sent line")
-    reply_terminator: Literal["\r", "\n", "\r\n"] = Field(description="end of a reply")
+    terminator: Terminator = Field(description="end of a sent line")
+    reply_terminator: Terminator = Field(
+        description="end of each line of a reply; if it is not of CR and LF only, such as a prompt,"
+        " the end of the whole reply"
+    )
     checksum: Literal["none", "dcon", "gen"] = Field(
         default="none", description="dcon: two hex digits; gen: $ and two hex digits"
     )
@@ -147,25 +159,43 @@ class AsciiTcpLink(TextLines):
     port: int = Field(ge=1, le=65535, description="TCP port; SCPI uses 5025")
 
 
-class BytesLink(BinaryLineSettings):
-    """Frames of fixed bytes on a serial line; a reply is as long as its example."""
+class ByteFrames(StreamSettings):
+    """Frames of fixed bytes; a reply is as long as its example."""
 
-    COMMON: ClassVar[tuple[str, ...]] = ("checksum", "echo")
+    COMMON: ClassVar[tuple[str, ...]] = ("checksum", "checksum_from", "checksum_before", "echo")
+
+    checksum: CrcName | Literal["sum8", "xor8"] = Field(
+        default="none",
+        description="check of each frame, least significant byte first; sum8: low byte of the sum;"
+        " xor8: exclusive or of all bytes",
+    )
+    checksum_from: int = Field(
+        default=0, ge=0, description="first byte that the checksum covers, counted from 0"
+    )
+    checksum_before: int = Field(
+        default=0, ge=0, description="number of bytes behind the checksum, such as an end byte"
+    )
+
+
+class BytesLink(ByteFrames, BinaryLineSettings):
+    """Frames of fixed bytes on a serial line."""
 
     kind: Literal["bytes"]
-    checksum: CrcName | Literal["sum8"] = Field(
-        default="none",
-        description="check after each frame, least significant byte first; sum8: low byte of the"
-        " sum",
-    )
+
+
+class BytesTcpLink(ByteFrames):
+    """Frames of fixed bytes on a TCP connection."""
+
+    kind: Literal["bytes_tcp"]
+    port: int = Field(ge=1, le=65535, description="TCP port")
 
 
 class Reply(StrictModel):
     """Form of a good reply."""
 
     pattern: Pattern = Field(
-        description="regular expression for a whole reply, no terminator; in frames, {value:int16}"
-        " stands for the bytes of the number"
+        description="regular expression for a whole reply, no terminator; a field such as {value}"
+        " or {value:int16} stands for the group with the number"
     )
     example: str = Field(description="a reply as in the manual; pattern must match it")
 
@@ -413,6 +443,11 @@ class AsciiWatchdog(SteppedWatchdog[AsciiStep]):
         return self
 
 
+AnyLink: TypeAlias = Annotated[
+    AsciiLink | AsciiTcpLink | BytesLink | BytesTcpLink, Field(discriminator="kind")
+]
+
+
 class AsciiProfile(BaseProfile):
     """A device with a text protocol or fixed frames."""
 
@@ -420,9 +455,7 @@ class AsciiProfile(BaseProfile):
     WIRES: ClassVar[Mapping[str, str]] = {"serial_dac": "hilctl_drivers.ascii.text_wire:TextWire"}
     SESSION: ClassVar[str] = "hilctl_drivers.ascii.ascii_session:AsciiSession"
 
-    link: Annotated[AsciiLink | AsciiTcpLink | BytesLink, Field(discriminator="kind")] = Field(
-        description="serial line or TCP connection"
-    )
+    link: AnyLink = Field(description="serial line or TCP connection")
     address: int | Literal["none"] = Field(description="device address as shipped, for {address}")
     outputs: dict[Name, AsciiOutput] = Field(description="outputs by name")
     inputs: dict[Name, AsciiInput] = Field(description="inputs by name")
@@ -493,7 +526,7 @@ class AsciiProfile(BaseProfile):
     def misfits(self) -> Iterator[tuple[str, str, str]]:
         """See :meth:`~hilctl_drivers.profile_base.BaseProfile.misfits`."""
         rule = "must be bytes in upper-case hexadecimal separated by blanks, such as 0A 1F"
-        if isinstance(self.link, BytesLink):
+        if isinstance(self.link, ByteFrames):
             for key, text in _texts(self, {*_REQUESTS, "example"}):
                 if not _is_bytes(text):
                     yield key, rule, repr(text)

@@ -1,16 +1,11 @@
-"""Session with a device of text or frames: messages, checksums, numbers, transmission times.
-
-DCON (ICP DAS, Advantech ADAM): ICP DAS "DCON protocol command set". GEN (TDK-Lambda): "Genesys User
-Manual" 7.5.
-"""
+"""Session with a device of text or frames: requests and replies, steps, transmission times."""
 
 import math
 import re
 import time
-from collections.abc import Callable, Iterator, Sequence
-from dataclasses import dataclass
+from collections.abc import Callable, Sequence
 from functools import partial
-from typing import ClassVar, Literal, TypeAlias, cast
+from typing import Literal, TypeAlias, cast
 
 from hilctl.base.errors import DeviceError
 from hilctl.base.formatting import printable
@@ -18,12 +13,10 @@ from hilctl_drivers.ascii.ascii_profile import (
     AsciiDigitalInput,
     AsciiDigitalOutput,
     AsciiInput,
-    AsciiLink,
     AsciiProfile,
     AsciiStep,
-    AsciiTcpLink,
     AskStep,
-    BytesLink,
+    ByteFrames,
     Check,
     MeasuredReply,
     NumberStep,
@@ -32,19 +25,14 @@ from hilctl_drivers.ascii.ascii_profile import (
     SendStep,
     fill,
 )
-from hilctl_drivers.ascii.number_format import as_text
+from hilctl_drivers.ascii.message_format import LineFormat, formats, lines_of
 from hilctl_drivers.endpoint import Endpoint
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.session import SteppedSession
-from hilctl_drivers.transport.crc import CRCS, Bytes, Crc, dcon_checksum, gen_checksum
-from hilctl_drivers.transport.framing import split_at
 from hilctl_drivers.transport.links import (
-    BadRequestError,
     CorruptError,
-    IncompleteError,
     Link,
     MismatchError,
-    Missing,
     NoAnswerError,
     RefusedError,
     WatchdogTrippedError,
@@ -53,139 +41,7 @@ from hilctl_drivers.transport.wire_time import WireTime
 
 _ERRORS_MAX = 50
 """Larger than the error queue of a device; a device that reports its state has no queue."""
-_CHECKSUMS = {"none": lambda _text: b"", "dcon": dcon_checksum, "gen": gen_checksum}
-_CHECKSUM_CHARS = {"none": 0, "dcon": 2, "gen": 3}
 _ADDRESSED = re.compile(r"[!?]([0-9A-F]{2})")
-
-
-def _is_text(text: str) -> bool:
-    return text.isascii() and text.isprintable()
-
-
-@dataclass(frozen=True)
-class LineFormat:
-    """Format of one line: ``text | checksum | terminator``."""
-
-    NAME: ClassVar[str] = "line"
-    terminator: bytes = b"\r"
-    checksum: Literal["none", "dcon", "gen"] = "none"  # two hex digits, for gen after a $
-    size_max: int = 255  # bytes without the terminator
-
-    def encode(self, text: str) -> bytes:
-        """Return a line; raise BadRequestError unless printable ASCII of good length."""
-        if not text or not _is_text(text):
-            raise BadRequestError(f"a line must be printable ASCII, got {text!r}")
-        body = text.encode("ascii")
-        body += _CHECKSUMS[self.checksum](body)
-        if len(body) > self.size_max:
-            raise BadRequestError(
-                f"a line has at most {self.size_max} bytes, got {len(body)}: {text!r}"
-            )
-        return body + self.terminator
-
-    def decode(self, line: Bytes) -> str:
-        """Return the text of exactly one line.
-
-        Raises:
-            IncompleteError: The terminator has not arrived yet.
-            CorruptError: Wrong checksum, too long, not printable ASCII, or bytes after the end.
-        """
-        data = bytes(line)
-        end = data.find(self.terminator)
-        if end < 0 and len(data) < self.size_max + len(self.terminator):
-            raise IncompleteError(f"{data!r} without {self.terminator!r}")
-        if end != len(data) - len(self.terminator):
-            rule = f"must be one line that ends in {self.terminator!r} (reply_terminator)"
-            raise CorruptError(f"{rule}, got {data!r}")
-        return self._text(data[:end])
-
-    def messages(self, received: bytearray) -> Iterator[str]:
-        """Remove the complete lines from a stream; yield the texts of the good ones."""
-        return split_at(received, self.terminator, self._text)
-
-    def size(self, text: str) -> int:
-        """Return the bytes of a text of one or more lines on the wire."""
-        extra = _CHECKSUM_CHARS[self.checksum] + len(self.terminator)
-        return len(text) + _lines(text) * extra - text.count("\n")
-
-    def missing(self, example: str) -> Missing:
-        """Return the number of bytes missing from a message with as many lines as ``example``."""
-        lines = _lines(example)
-
-        def missing(got: bytearray) -> int:
-            if len(got) > (lines + 1) * self.size_max:
-                raise CorruptError(f"no end of line within {len(got)} bytes")
-            return max(0, lines - got.count(self.terminator))
-
-        return missing
-
-    def split(self, data: Bytes, example: str) -> list[str]:
-        """Return the texts of a reply with as many lines as ``example``, or more."""
-        *others, last = bytes(data).split(self.terminator, example.count("\n"))
-        return [self.decode(line) for line in (*(each + self.terminator for each in others), last)]
-
-    def _text(self, part: Bytes) -> str:
-        body = bytes(part)
-        if len(body) > self.size_max:
-            raise CorruptError(f"a line has at most {self.size_max} bytes, got {len(body)}")
-        text = body.decode("latin-1")
-        if not _is_text(text):
-            ends = " (compare link.reply_terminator)" if body[-1:] in b"\r\n" else ""
-            raise CorruptError(f"a line must be printable ASCII, got {body!r}{ends}")
-        split = max(0, len(body) - _CHECKSUM_CHARS[self.checksum])
-        want = _CHECKSUMS[self.checksum](body[:split])
-        if body[split:] != want:
-            raise CorruptError(f"checksum of {text!r} must be {want.decode()}")
-        return text[:split]
-
-
-@dataclass(frozen=True)
-class FrameFormat:
-    """Format of one frame, whose text is its bytes in hexadecimal: ``bytes | checksum``."""
-
-    check: Crc = CRCS["none"]
-    NAME: ClassVar[str] = "frame"
-
-    def encode(self, text: str) -> bytes:
-        """Return a frame."""
-        data = bytes.fromhex(text)
-        return data + self.check.of(data)
-
-    def decode(self, frame: Bytes) -> str:
-        """Return the text of exactly one frame; raise CorruptError if its checksum is wrong."""
-        end = len(frame) - self.check.size
-        data, sent = bytes(frame[:end]), bytes(frame[end:])
-        if sent != self.check.of(data):
-            raise CorruptError(f"{self.check.name} of {as_text(data)} is wrong")
-        return as_text(data)
-
-    def size(self, text: str) -> int:
-        """Return the bytes of a text of one or more frames on the wire."""
-        return len(b"".join(map(self.encode, text.split("\n"))))
-
-    def missing(self, example: str) -> Missing:
-        """Return the number of bytes missing from a frame as long as ``example``."""
-        size = self.size(example)
-        return lambda got: max(0, size - len(got))
-
-    def split(self, data: Bytes, example: str) -> list[str]:
-        """Return the text of a reply."""
-        return [self.decode(data)]
-
-
-MessageFormat: TypeAlias = LineFormat | FrameFormat
-_FRAME_CHECKS = {**CRCS, "sum8": Crc("sum8", 8, lambda data: sum(data) & 0xFF)}
-
-
-def formats(link: AsciiLink | AsciiTcpLink | BytesLink) -> tuple[MessageFormat, MessageFormat]:
-    """Return the formats of requests and of replies."""
-    if isinstance(link, BytesLink):
-        frames = FrameFormat(_FRAME_CHECKS[link.checksum])
-        return frames, frames
-    return (
-        LineFormat(link.terminator.encode(), link.checksum, link.max_line_chars or 255),
-        LineFormat(link.reply_terminator.encode(), link.checksum),
-    )
 
 
 def reading(form: MeasuredReply, ask: Callable[..., re.Match[str]]) -> float:
@@ -214,6 +70,7 @@ class AsciiSession(SteppedSession):
     ) -> None:
         self.profile = profile
         self._requests, self._replies = formats(profile.link)
+        self._prompts = isinstance(self._replies, LineFormat) and self._replies.is_whole
         # An echo of frames is removed by the link.
         self._echoes = profile.link.echo and not profile.link.removes_echo
         self.address = profile.unit if address is None else address
@@ -267,13 +124,15 @@ class AsciiSession(SteppedSession):
 
     def line(self, text: str) -> bytes:
         """Encode a text of one or more messages for the wire."""
-        return b"".join(map(self._requests.encode, text.split("\n")))
+        return self._requests.wire(text)
 
     def send(self, text: str) -> None:
         """Send a text that has no reply."""
         request = self.line(text)
-        if self._echoes:
-            self._check_echo(text, self.link.transact(request, self._replies.missing(text)))
+        if self._prompts:
+            self._transact(text, "")
+        elif self._echoes:
+            self._check_echo(text, self.link.transact(request, self._replies.missing(text, text)))
         else:
             self.link.transact(request, lambda got: 0)
 
@@ -358,7 +217,7 @@ class AsciiSession(SteppedSession):
             try:
                 text, reply = self._ask(test)
             except NoAnswerError as error:
-                if isinstance(self.profile.link, BytesLink):
+                if isinstance(self.profile.link, ByteFrames):
                     raise
                 keys = "link.terminator and link.reply_terminator"
                 raise NoAnswerError(f"{error}; compare {keys} with the manual") from None
@@ -389,14 +248,16 @@ class AsciiSession(SteppedSession):
 
     def _transact(self, text: str, example: str) -> str:
         """Send a text and return its reply, which has the length of ``example`` and is no error."""
-        missing = self._replies.missing(f"{text}\n{example}" if self._echoes else example)
+        missing = self._replies.missing(text, f"{text}\n{example}" if self._echoes else example)
         try:
             data: bytes | bytearray = self.link.transact(self.line(text), missing)
         except NoAnswerError as error:
             raise NoAnswerError(f"{printable(text)}: {error}") from None
-        if self._echoes:
+        if self._echoes and not self._prompts:
             data = self._check_echo(text, data)
-        replies = self._replies.split(data, example)
+        replies = self._replies.split(data, text, example)
+        if self._echoes and self._prompts:
+            replies = _without_echo(text, replies)
         for reply in replies:
             self._check_trouble(text, reply)
         return "\n".join(replies)
@@ -435,7 +296,7 @@ class AsciiSession(SteppedSession):
     def _check_echo(self, text: str, data: bytes | bytearray) -> bytes | bytearray:
         assert isinstance(self._replies, LineFormat)
         end = self._replies.terminator
-        *echo, rest = data.split(end, _lines(text))
+        *echo, rest = data.split(end, lines_of(text))
         if [bytes(line).strip(b"\r\n") for line in echo] != [
             line.rstrip(b"\r\n") for line in map(self._requests.encode, text.split("\n"))
         ]:
@@ -443,8 +304,12 @@ class AsciiSession(SteppedSession):
         return rest
 
 
-def _lines(text: str) -> int:
-    return text.count("\n") + 1
+def _without_echo(text: str, replies: Sequence[str]) -> list[str]:
+    """Return whole replies without the echo of their line."""
+    parts = [reply.partition("\n") for reply in replies]
+    if [echo for echo, _, _ in parts] != text.split("\n"):
+        raise CorruptError(f"{printable(text)}: came back as {'; '.join(replies)!r}")
+    return [rest for _, _, rest in parts]
 
 
 def _came_back(text: str) -> MismatchError:
@@ -504,6 +369,6 @@ def _lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float =
     replies = [reply for _, reply in lines if reply is not None]
     sent = sum(requests.size(text) for text, _ in lines)
     received = sum(map(answers.size, replies))
-    count = sum(_lines(text) for text, _ in lines)
+    count = sum(lines_of(text) for text, _ in lines)
     what = f"{count} {requests.NAME}{'' if count == 1 else 's'}"
     return profile.wire_time(what, sent, received, len(lines), len(replies), settle_s)

@@ -154,7 +154,11 @@ class _Plan:
     def _may_share(self, wanted: ReaderLine | None) -> bool:
         """Return whether the reader is on the line of the device; raise InputError if it cannot."""
         profile, reader = self._profile, self._reader
-        alike = type(profile) is type(reader) and reader.link.kind not in {"bytes", "frames"}
+        alike = type(profile) is type(reader) and reader.link.kind not in {
+            "bytes",
+            "bytes_tcp",
+            "frames",
+        }
         if wanted == "same" and not alike:
             raise InputError(f"{reader.title} cannot share the line of {profile.title}: use own")
         shares = wanted or ("same" if reader.link.kind == "rtu" else "own")

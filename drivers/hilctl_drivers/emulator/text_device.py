@@ -7,7 +7,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     AsciiProfile,
     AsciiStep,
     AskStep,
-    BytesLink,
+    ByteFrames,
     MeasuredReply,
     NumberReply,
     NumberStep,
@@ -15,6 +15,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     SendStep,
     pattern_of,
 )
+from hilctl_drivers.ascii.message_format import LineFormat, formats
 from hilctl_drivers.emulator.rig import Bench
 from hilctl_drivers.emulator.wire import EmulatedReply, SerialDevice, TemplateMatcher
 
@@ -69,6 +70,8 @@ class EmulatedText(SerialDevice):
         for name, driven in self._driven.items():
             driven.rig.put_out(driven.wiring.command(self._values[name]), 0)
         self._errors: list[str] = []
+        _, replies = formats(profile.link)
+        self._prompts = isinstance(replies, LineFormat) and replies.is_whole
 
     def answer(self, message: bytes, now_ns: int) -> EmulatedReply | None:
         """Execute a line and return the reply; None if it is for another address."""
@@ -84,7 +87,7 @@ class EmulatedText(SerialDevice):
         for part in parts:
             found = part(text)
             if found is not None:
-                return EmulatedReply(found.encode() or None)
+                return self._reply(found)
         return None if self._is_for_another(text) else self._rejection(_UNDEFINED)
 
     def refusal(self, message: bytes) -> EmulatedReply:
@@ -94,13 +97,17 @@ class EmulatedText(SerialDevice):
     def _rejection(self, error: str) -> EmulatedReply:
         """Return the profile's last error reply; without one, keep the error for a query."""
         if self.profile.errors:
-            return EmulatedReply(self.profile.errors[-1].example.encode() or None)
+            return self._reply(self.profile.errors[-1].example)
         self._errors.append(error)
-        return EmulatedReply(None)
+        return self._reply("")
+
+    def _reply(self, text: str) -> EmulatedReply:
+        """Return a reply; a prompt follows also if it is empty."""
+        return EmulatedReply(text.encode() if text or self._prompts else None)
 
     def wrong_id(self, reply: bytes) -> bytes:
         """Return a reply from another address, or to another query if it has no address."""
-        if isinstance(self.profile.link, BytesLink):
+        if isinstance(self.profile.link, ByteFrames):
             return b"FF" + reply[2:]
         own = f"{self._address:02X}".encode()
         if len(reply) >= 3 and reply[1:3] == own:
@@ -213,7 +220,7 @@ class EmulatedText(SerialDevice):
         query = self.profile.error_query
         if query != "none" and self._matches(query.ask, text):
             # The profile does not describe errors in bytes.
-            in_text = not isinstance(self.profile.link, BytesLink)
+            in_text = not isinstance(self.profile.link, ByteFrames)
             return self._errors.pop(0) if self._errors and in_text else query.example
         test = self.profile.selftest
         return test.example if test != "none" and self._matches(test.ask, text) else None

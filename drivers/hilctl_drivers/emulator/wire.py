@@ -5,11 +5,11 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from string import Formatter
-from typing import TypeAlias
+from typing import TypeAlias, cast
 
 from hilctl_drivers.ascii.ascii_profile import SAMPLES, AsciiProfile, fill
-from hilctl_drivers.ascii.ascii_session import FrameFormat, formats
-from hilctl_drivers.ascii.number_format import as_text, number_format
+from hilctl_drivers.ascii.message_format import FrameFormat, LineFormat, formats
+from hilctl_drivers.ascii.number_format import number_format
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
 from hilctl_drivers.emulator.rig import EmulatedDevice
 from hilctl_drivers.transport.crc import Bytes
@@ -122,11 +122,11 @@ def _frame_size(form: FrameFormat, profile: AsciiProfile) -> Callable[[Bytes], i
     known.sort(key=lambda each: -each.size)
 
     def size_of(data: Bytes) -> int:
-        text = as_text(bytes(data))
         for each in known:
-            if each.match(text[: each.size]) is not None:
-                return (each.size + 1) // 3 + form.check.size
-        if len(text) >= known[0].size:
+            size = (each.size + 1) // 3 + form.check.size
+            if len(data) >= size and each.match(form.text(data[:size])) is not None:
+                return size
+        if len(data) > known[0].size // 3 + form.check.size:
             raise CorruptError("no request begins here")
         return 0
 
@@ -144,7 +144,7 @@ class EmulatedLine(EmulatedWire):
         self._messages: Callable[[bytearray], Iterator[str] | Iterator[bytes]]
         self._encode: Callable[[bytes], bytes]
         link = profile.link
-        self._is_text = not isinstance(link, FramesLink)
+        self._is_text, self._echoes = not isinstance(link, FramesLink), False
         if isinstance(link, FramesLink):
             framing = binary_framing(link.framing, link.crc, link.payload_max)
             self._messages, self._encode = framing.messages, framing.encode
@@ -155,8 +155,9 @@ class EmulatedLine(EmulatedWire):
                 size_of, decode = _frame_size(requests, profile), requests.decode
                 self._messages = lambda received: split_sized(received, size_of, decode)
             else:
-                self._messages = requests.messages
-            self._encode = lambda message: replies.encode(message.decode())
+                self._messages = cast(LineFormat, requests).messages
+            self._encode = lambda message: replies.wire(message.decode())
+            self._echoes = link.echo
 
     def requests(self, received: bytearray) -> Iterator[bytes]:
         """Yield the valid messages; an incomplete one is kept without a time limit."""
@@ -171,6 +172,8 @@ class EmulatedLine(EmulatedWire):
         for device in self.devices:
             answer = device.answer(request, now_ns)
             if answer is not None:
+                if self._echoes:
+                    answer = replace(answer, data=b"\n".join(filter(None, (request, answer.data))))
                 return replace(answer, wrong_id=device.wrong_id)
         return None
 

@@ -90,7 +90,9 @@ WATCHDOG = {
     "arm": [{"kind": "write", "address": 9, "type": "uint16", "value": "timeout"}],
 }  # fmt: skip
 
-KINDS = "must be one of ascii, ascii_tcp, bytes, frames, rtu, rtu_tcp, sensor_stream, tcp"
+KINDS = (
+    "must be one of ascii, ascii_tcp, bytes, bytes_tcp, frames, rtu, rtu_tcp, sensor_stream, tcp"
+)
 
 BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"verified": "yes"}, "must be partly or no if unverified lists keys"),

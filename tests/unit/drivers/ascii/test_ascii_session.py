@@ -9,11 +9,9 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.ascii.ascii_profile import Reply
 from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
-    FrameFormat,
-    LineFormat,
     exchange_time,
-    formats,
 )
+from hilctl_drivers.ascii.message_format import FrameFormat, LineFormat, formats
 from hilctl_drivers.ascii.number_format import parse_number
 from hilctl_drivers.profile import load_profile, with_link
 from hilctl_drivers.transport import links
