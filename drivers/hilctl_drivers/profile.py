@@ -29,6 +29,8 @@ LINK_KINDS = {
     "rtu": "modbus.modbus_profile:ModbusProfile",
     "rtu_tcp": "modbus.modbus_profile:ModbusProfile",
     "sensor_stream": "sensor_stream.stream_profile:StreamProfile",
+    "sensor_stream_serial": "sensor_stream.stream_profile:StreamProfile",
+    "sensor_stream_udp": "sensor_stream.stream_profile:StreamProfile",
     "tcp": "modbus.modbus_profile:ModbusProfile",
 }
 """Class of profiles per ``link.kind``; imported when it is needed."""

@@ -44,6 +44,8 @@ _PROTOCOLS = {
     "bytes_tcp": "frames of fixed bytes over TCP",
     "frames": "binary frames",
     "sensor_stream": "samples sent unasked",
+    "sensor_stream_serial": "samples sent unasked",
+    "sensor_stream_udp": "samples sent unasked",
 }
 """Names of protocols by ``link.kind`` of a profile."""
 

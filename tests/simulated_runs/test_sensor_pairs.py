@@ -15,6 +15,7 @@ from hilctl.experiment.devices import device_class
 from hilctl_drivers.emulator.options import EmulatorOptions
 from hilctl_drivers.profile import load_profile, shipped_profiles
 from hilctl_drivers.simulated.devices import TerfenolOptions
+from hilctl_drivers.transport.serial_port import SerialLink
 from tests.fakes import ManualClock, ShiftedClock, emulated, logged, one_rig
 
 SAMPLES = 2000
@@ -123,9 +124,23 @@ turnaround_s: 0.0
 max_rate_hz: 1000.0
 watchdog: none
 """
+DATAGRAMS = """\
+vendor: nobody
+model: a sensor that sends datagrams with a binary beginning
+source: [this test]
+verified: "yes"
+link: {kind: sensor_stream_udp, port: 4002, max_age_s: 0.02}
+header: {begin: AA 55, size: 6, frame_size: 4, counter: {at: 2, type: uint32}}
+outputs: {}
+inputs:
+  position1: {at: 0, type: float32, unit: um, min: -125, max: 125}
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+watchdog: none
+"""
 OWN = {
     "gcs": GCS, "frames": FRAMES, "hexadecimal": HEXADECIMAL, "xor_frames": XOR_FRAMES,
-    "comma": COMMA,
+    "comma": COMMA, "datagrams": DATAGRAMS,
 }  # fmt: skip
 PAIRS = {
     "text with LabJack": ("kepco_bop", {"reader": "labjack_t7"}),
@@ -143,6 +158,8 @@ PAIRS = {
     "text with frames": ("kepco_bop", {"reader": "frames"}),
     "Modbus RTU with a board": ("icp_m7024", {"reader": "cobs_board"}),
     "text with a stream": ("kepco_bop", {"reader": "capancdt_6200"}),
+    "text with a stream on a serial line": ("kepco_bop", {"reader": "optoncdt_1420"}),
+    "text with a stream of datagrams": ("kepco_bop", {"reader": "datagrams"}),
 }  # fmt: skip
 
 
@@ -174,18 +191,21 @@ class SentBlocks:
         self.shown_um.append(self._reader._wired[0].rig.displacement_um)
         return data
 
-    def last_read_um(self, device, before_ns):
+    def last_read_um(self, device, before_ns, read_um):
         """Return the reading of the block that an exchange since ``before_ns`` must have read.
 
-        All blocks of before the previous exchange have arrived.
+        All blocks of before the previous exchange have arrived. On a serial line the age is an
+        upper bound, so that the block is one of those since.
         """
         arrived_ns = device._reader.session._arrived_ns
         at_ns = arrived_ns + round(1e9 * device.reading_age_s)
         assert before_ns <= at_ns + 1
         assert at_ns <= time.monotonic_ns() + 1
+        complete, self._complete = self._complete, bisect_right(self.sent_ns, before_ns) - 2
+        if isinstance(device._reader.link, SerialLink):
+            return min(self.shown_um[max(0, complete) :], key=lambda each: abs(each - read_um))
         number = bisect_right(self.sent_ns, arrived_ns) - 1
-        assert number >= self._complete
-        self._complete = bisect_right(self.sent_ns, before_ns) - 2
+        assert number >= complete
         return self.shown_um[number]
 
 
@@ -194,7 +214,7 @@ def test_all_commands_and_readings_are_those_of_the_devices(profile, tmp_path, n
     output, options = PAIRS[name]
     if "reader" in options:
         options = {**options, "reader": profile(options["reader"])}
-    streams = name == "text with a stream"
+    streams = "stream" in name
     log, clock = tmp_path / "log.jsonl", ShiftedClock() if streams else ManualClock()
     path = profile(output)
     with emulated(
@@ -222,7 +242,7 @@ def test_all_commands_and_readings_are_those_of_the_devices(profile, tmp_path, n
                 shown_um[k] = emulator.rigs[0].rig.displacement_um
                 clock.pass_s(0.001)
             else:
-                shown_um[k] = blocks.last_read_um(device, before_ns)
+                shown_um[k] = blocks.last_read_um(device, before_ns, displacement_um[k])
         assert device.info.details["transactions"] == ("1" if streams else "2")
         assert device.lost_readings == 0
         device.close()

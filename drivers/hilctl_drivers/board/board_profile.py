@@ -1,7 +1,7 @@
 """Profiles of microcontroller boards; messages are in :mod:`hilctl_drivers.board.frames`."""
 
 from collections.abc import Mapping
-from typing import ClassVar, Literal, Self
+from typing import Any, ClassVar, Literal, Self
 
 from pydantic import Field, model_validator
 
@@ -35,10 +35,10 @@ class FramesLink(BinaryLineSettings):
         return self
 
 
-class FrameChannel(Range):
-    """A DAC or ADC of a board: encoding of its values in a message."""
+class RawChannel(Range):
+    """A channel with raw values in bytes."""
 
-    type: RegisterType = Field(description="how a raw value is stored")
+    type: str = Field(description="how a raw value is stored")
     order: str = Field(default="", description="as in a register; DCBA is least significant first")
     scale: float = Field(default=1.0, description="value = raw * scale + offset")
     offset: float = Field(default=0.0, description="value = raw * scale + offset")
@@ -53,6 +53,17 @@ class FrameChannel(Range):
                 f" {self.unit}, got {self.min:g} to {self.max:g}"
             )
         return self
+
+    @property
+    def format(self) -> Any:
+        """Encoding of a value as bytes, such as a :class:`RegisterFormat`."""
+        raise NotImplementedError
+
+
+class FrameChannel(RawChannel):
+    """A DAC or ADC of a board: encoding of its values in a message."""
+
+    type: RegisterType = Field(description="how a raw value is stored")
 
     @property
     def format(self) -> RegisterFormat:

@@ -2,6 +2,7 @@
 
 from hilctl_drivers.emulator.rig import Bench, EmulatedDevice
 from hilctl_drivers.emulator.wire import EmulatedWire
+from hilctl_drivers.sensor_stream.bits import bits_of, fixed_bits
 from hilctl_drivers.sensor_stream.stream_profile import HeaderField, StreamProfile
 
 PERIOD_NS = 1_000_000
@@ -23,30 +24,36 @@ class EmulatedStream(EmulatedDevice, EmulatedWire):
         """Time until which its samples are lost."""
 
     def block(self, now_ns: int) -> bytes:
-        """Return the block with the samples since the last one; all show the present readings."""
+        """Return the blocks with the samples since the last ones; all show the present readings."""
         self.tick(now_ns)
         self._begin_ns = now_ns if self._begin_ns is None else self._begin_ns
-        due = 1 + int((now_ns - self._begin_ns) * self.profile.max_rate_hz * 1e-9) - self._sent
-        header = self.profile.header
-        frames = due if isinstance(header.frames, HeaderField) else min(due, 1)
-        if not frames or now_ns < self.stalled_until_ns:
-            self._sent += due
+        first = self._sent
+        self._sent = 1 + int((now_ns - self._begin_ns) * self.profile.max_rate_hz * 1e-9)
+        due = self._sent - first
+        if not due or now_ns < self.stalled_until_ns:
             return b""
         frame = self._frame()
-        head = bytearray(header.begin.encode().ljust(header.size, b"\0"))
+        if isinstance(self.profile.header.frames, HeaderField):
+            return self._block(first, frame, due)
+        return b"".join(self._block(number, frame, 1) for number in range(first, self._sent))
+
+    def _block(self, first: int, frame: bytes, frames: int) -> bytes:
+        """Return a block with a frame several times; ``first`` is its number."""
+        header = self.profile.header
+        block = bytearray(header.size) + frame * frames
+        for k, byte in enumerate(fixed_bits(bits_of(header.begin))):
+            block[k] |= byte
         numbers = (
             (header.frames, frames),
             (header.frame_size, len(frame)),
-            (header.counter, self._sent),
+            (header.counter, first),
         )
         for field, number in numbers:
             if isinstance(field, HeaderField):
                 modulus = 1 << 8 * field.format.size
-                head[field.at : field.at + field.format.size] = field.format.encode(
-                    number % modulus
-                )
-        self._sent += due
-        return bytes(head) + frame * frames
+                encoded = field.format.encode(number % modulus)
+                block[field.at : field.at + field.format.size] = encoded
+        return bytes(block)
 
     def _frame(self) -> bytes:
         """Return a frame with the readings; the other values are 0."""

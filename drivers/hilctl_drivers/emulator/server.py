@@ -80,6 +80,26 @@ class _TcpConnection(_Connection):
         self._connection.close()
 
 
+class _UdpConnection(_Connection):
+    """Datagrams to a host, which may not listen."""
+
+    def __init__(self, wire: EmulatedWire, host: str, port: int) -> None:
+        self._socket = socket.socket(socket.AF_INET, socket.SOCK_DGRAM)
+        self._socket.setblocking(False)
+        self._socket.connect((host, port))
+        super().__init__(self._socket.fileno(), wire, faulty=True)
+
+    def read(self) -> bytes | None:
+        return super().read() or b""
+
+    def send(self, data: bytes) -> None:
+        with suppress(OSError):
+            os.write(self._fd, data)
+
+    def close(self, *, reset: bool = False) -> None:
+        self._socket.close()
+
+
 class _PtyConnection(_Connection):
     """Connection to the program at the other end of a pty; there is nothing to reset."""
 
@@ -143,15 +163,30 @@ class EmulatorServer:
         self._listeners[listener] = wire
         self._wires.append(wire)
         self._selector.register(listener, selectors.EVENT_READ)
+        self._begin_stream(wire)
+        return f"{host}:{listener.getsockname()[1]}"
+
+    def send_udp(self, wire: EmulatedWire, host: str, port: int) -> str:
+        """Send a stream to a UDP port, or to a free one if 0."""
+        if not port:
+            with socket.socket(socket.AF_INET, socket.SOCK_DGRAM) as free:
+                free.bind((host, 0))
+                port = free.getsockname()[1]
+        self._add(_UdpConnection(wire, host, port))
+        self._wires.append(wire)
+        self._begin_stream(wire)
+        return f"{host}:{port}"
+
+    def _begin_stream(self, wire: EmulatedWire) -> None:
         if isinstance(wire, EmulatedStream):
             self._push(wire, self._clock_ns())
-        return f"{host}:{listener.getsockname()[1]}"
 
     def open_pty(self, wire: EmulatedWire, *, faulty: bool = True) -> str:
         """Open a pty and return the device file of its other end."""
         connection = _PtyConnection(wire, faulty=faulty)
         self._wires.append(wire)
         self._add(connection)
+        self._begin_stream(wire)
         return connection.name
 
     def run(self) -> None:

@@ -1,1 +1,1 @@
-"""Sensors that send unsolicited samples over TCP: profile and session."""
+"""Sensors that send unsolicited samples: profile and session."""

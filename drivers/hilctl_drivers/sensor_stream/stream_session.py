@@ -3,14 +3,24 @@
 import math
 import time
 from collections.abc import Callable
-from typing import cast
+from typing import TypeAlias, cast
 
 from hilctl_drivers.endpoint import Endpoint
-from hilctl_drivers.sensor_stream.stream_profile import HeaderField, StreamInput, StreamProfile
+from hilctl_drivers.profile_base import SerialLineSettings
+from hilctl_drivers.sensor_stream.bits import bits_of, bits_regex
+from hilctl_drivers.sensor_stream.stream_profile import (
+    HeaderField,
+    SensorStreamUdpLink,
+    StreamInput,
+    StreamProfile,
+)
 from hilctl_drivers.session import Session
 from hilctl_drivers.transport.links import CorruptError, NoAnswerError
-from hilctl_drivers.transport.tcp import TcpReceiver
+from hilctl_drivers.transport.serial_port import SerialLink
+from hilctl_drivers.transport.tcp import TcpReceiver, UdpReceiver
 from hilctl_drivers.transport.wire_time import WireTime
+
+Receiver: TypeAlias = TcpReceiver | SerialLink
 
 
 class BlockParser:
@@ -24,7 +34,10 @@ class BlockParser:
 
     def __init__(self, profile: StreamProfile, source: StreamInput) -> None:
         self._header = header = profile.header
-        self._begin = header.begin.encode()
+        bits = bits_of(header.begin)
+        self._begin, self._begin_size = bits_regex(bits), len(bits.split())
+        # Only a serial line loses single bytes, or damages them.
+        self._resyncs = isinstance(profile.link, SerialLineSettings)
         self._frames = _number(header.frames)
         self._frame_size = _number(header.frame_size)
         counter = header.counter
@@ -42,16 +55,23 @@ class BlockParser:
     def feed(self, data: bytes) -> bool:
         """Process received bytes; return whether they complete a frame.
 
+        On a serial line a damaged block is skipped, and counts as a lost one.
+
         Raise CorruptError if a block does not begin as in the profile, or has no such input.
         """
-        received, header, newest, start = self._received, self._header.size, 0, 0
+        received, header, newest, start = self._received, self._header.size, -1, 0
         received += data
-        if not self.values:
-            self._find_begin()
-        while len(received) - start >= header:
-            if not received.startswith(self._begin, start):
-                found = bytes(received[start : start + len(self._begin)])
-                raise CorruptError(f"a block must begin with {self._begin!r}, got {found!r}")
+        if not self.values:  # the connection may begin within a block
+            del received[: self._next_begin(0)]
+        while len(received) - start >= max(header, self._begin_size):
+            if not self._begin.match(received, start):
+                if not self._resyncs:
+                    found = bytes(received[start : start + self._begin_size])
+                    begin = self._header.begin
+                    raise CorruptError(f"a block must begin with {begin}, got {found!r}")
+                self.lost += 1
+                start = self._next_begin(start + 1)
+                continue
             head = received[start : start + header]
             frames, size = self._frames(head), self._frame_size(head)
             end = start + header + frames * size
@@ -62,16 +82,16 @@ class BlockParser:
                 self._count(head, frames)
                 newest = end - size + self._at
             start = end
-        if newest:
+        if newest >= 0:
             value = self._decode(received[newest : newest + self._form.size])
             self.value = value if self._low <= value <= self._high else math.nan
         del received[:start]
-        return newest > 0
+        return newest >= 0
 
-    def _find_begin(self) -> None:
-        """Discard bytes before the first block; the connection may begin within one."""
-        at = self._received.find(self._begin)
-        del self._received[: at if at >= 0 else max(0, len(self._received) - len(self._begin) + 1)]
+    def _next_begin(self, start: int) -> int:
+        """Return the position of the next begin of a block, or of bytes that may be one."""
+        found = self._begin.search(self._received, start)
+        return found.start() if found else max(start, len(self._received) - self._begin_size + 1)
 
     def _check_size(self, size: int) -> None:
         if self._at + self._form.size > size:
@@ -102,21 +122,25 @@ class SensorStreamSession(Session):
     AGES = True
     READS_ANY = False
 
-    def __init__(self, profile: StreamProfile, receiver: TcpReceiver, wait_s: float) -> None:
+    def __init__(self, profile: StreamProfile, receiver: Receiver, wait_s: float) -> None:
         self._profile = profile
         self._receiver = receiver
         self._wait_s = wait_s
         self._arrived_ns = 0
 
     @classmethod
-    def on(cls, device: Endpoint, link: TcpReceiver) -> "SensorStreamSession":
+    def on(cls, device: Endpoint, link: Receiver) -> "SensorStreamSession":
         """See :meth:`~hilctl_drivers.session.Session.on`."""
         return cls(cast(StreamProfile, device.profile), link, device.timeout_s)
 
     @staticmethod
-    def new_link(device: Endpoint) -> TcpReceiver:
+    def new_link(device: Endpoint) -> Receiver:
         """See :meth:`~hilctl_drivers.session.Session.new_link`."""
-        return TcpReceiver(device.host, int(device.port), device.timeout_s)
+        line, timeout_s = device.profile.link, device.timeout_s
+        if isinstance(line, SerialLineSettings) and not device.host:
+            return SerialLink(str(device.port), line, timeout_s)
+        kind = UdpReceiver if isinstance(line, SensorStreamUdpLink) else TcpReceiver
+        return kind(device.host, int(device.port), timeout_s)
 
     @staticmethod
     def read_time(profile: StreamProfile, source: StreamInput) -> WireTime:
@@ -141,8 +165,9 @@ class SensorStreamSession(Session):
         deadline = time.monotonic() + self._wait_s
         while not self._parser.values:
             if not self._receiver.wait(deadline - time.monotonic()):
-                begin = self._profile.header.begin
-                raise NoAnswerError(f"no block that begins with {begin} within {self._wait_s:g} s")
+                rule = f"no block that begins with {self._profile.header.begin}"
+                line = "; compare baud" if isinstance(self._receiver, SerialLink) else ""
+                raise NoAnswerError(f"{rule} within {self._wait_s:g} s{line}")
             self._take()
 
     def _take(self) -> None:

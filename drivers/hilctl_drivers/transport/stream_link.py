@@ -27,7 +27,7 @@ from hilctl_drivers.transport.links import (
 
 _FIRST = 256
 """Most replies are shorter; see :mod:`hilctl_drivers.transport.tcp`."""
-_CHUNK = 4096
+_CHUNK, _UNSOLICITED = 4096, 65536
 _QUIET_S = 0.02
 
 
@@ -84,6 +84,7 @@ class StreamLink(ABC):
         self._count_waiting: Callable[[], object] = lambda: None
         self._stale = True
         self._quiet_at = 0.0
+        self._looked_ns = time.monotonic_ns()
         self._silent_hint = ""  # why there may be no answer; empty after the first one
 
     def set_timeout(self, timeout_s: float) -> None:
@@ -157,6 +158,25 @@ class StreamLink(ABC):
             self._quiet_at = self._clock() + self._gap_s
         return reply[len(request) :] if self._echo else reply
 
+    def wait(self, wait_s: float) -> bool:
+        """Wait for unsolicited data; return whether any has arrived."""
+        return bool(self._poll.poll(max(0.0, 1e3 * wait_s)))
+
+    def receive(self) -> tuple[bytes, int]:
+        """Return received unsolicited data, without waiting, and the longest age of its end in ns.
+
+        The kernel does not report when it arrived, so the age is the time since the last call.
+        """
+        if self._fd < 0:
+            raise LostError("not open")
+        looked_ns, self._looked_ns = self._looked_ns, time.monotonic_ns()
+        try:
+            self._count_waiting()
+            data = self._read(_UNSOLICITED) if self._waiting[0] else b""
+        except (OSError, DeviceError) as error:
+            raise self._failed(error) from None
+        return data, self._looked_ns - looked_ns
+
     def send_now(self, request: bytes | bytearray) -> None:
         """Send ``request`` regardless of bytes on the line, without waiting for a reply.
 
@@ -229,8 +249,8 @@ class StreamLink(ABC):
             reply += self._read()
         return reply
 
-    def _read(self) -> bytes:
-        data = read(self._fd, _CHUNK)
+    def _read(self, size: int = _CHUNK) -> bytes:
+        data = read(self._fd, size)
         if not data:
             self._nothing_read()
         return data

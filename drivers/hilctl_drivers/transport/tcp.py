@@ -6,6 +6,7 @@ import socket
 import struct
 import time
 from collections.abc import Callable
+from typing import ClassVar
 
 from hilctl.base.errors import DeviceError
 from hilctl.base.files import CONNECT_REMEDIES
@@ -146,6 +147,7 @@ class TcpLink(_Connection):
 class TcpReceiver(_Connection):
     """A TCP connection on which only the device sends."""
 
+    DATAGRAMS: ClassVar[bool] = False
     _looked_ns = 0
 
     def open(self) -> None:
@@ -178,14 +180,16 @@ class TcpReceiver(_Connection):
         looked_ns, self._looked_ns = self._looked_ns, time.monotonic_ns()
         try:
             for _ in range(_MOST_CHUNKS):
-                data, notes, *_rest = self._socket.recvmsg(_RECEIVED, _NOTE_SIZE)
-                if not data:
+                data, notes, _flags, sender = self._socket.recvmsg(_RECEIVED, _NOTE_SIZE)
+                if self.DATAGRAMS:
+                    data = data if sender[0] == self._host else b""
+                elif not data:
                     raise LostError("connection closed by the device")
                 received += data
                 for _level, _kind, stamp in notes:
                     seconds, ns = _TIMESPEC.unpack(stamp)
                     arrived_ns = seconds * 10**9 + ns
-                if len(data) < _RECEIVED:
+                if len(data) < _RECEIVED and not self.DATAGRAMS:
                     break
         except BlockingIOError:
             pass
@@ -193,6 +197,26 @@ class TcpReceiver(_Connection):
             raise LostError(f"connection lost: {why(error)}") from None
         age_ns = max(0, time.time_ns() - arrived_ns)
         return received, min(age_ns, time.monotonic_ns() - looked_ns)
+
+
+class UdpReceiver(TcpReceiver):
+    """A UDP port of this machine; datagrams of other senders than the device are discarded."""
+
+    DATAGRAMS: ClassVar[bool] = True
+
+    def _connect(self) -> socket.socket:
+        self.close()
+        try:
+            family, *_, address = socket.getaddrinfo(
+                self._host, self._port, type=socket.SOCK_DGRAM
+            )[0]
+            self._host = str(address[0])
+            self._socket = made = socket.socket(family, socket.SOCK_DGRAM)
+            made.bind(("", self._port))
+        except OSError as error:
+            self.close()
+            raise LostError(f"cannot listen on UDP port {self._port}: {why(error)}") from None
+        return made
 
 
 class TcpStream(_Connection, StreamLink):

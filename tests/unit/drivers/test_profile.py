@@ -14,6 +14,7 @@ from hilctl_drivers.board.board_profile import FrameProfile
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import (
     FOLDER,
+    LINK_KINDS,
     load_profile,
     parse_profile,
     profile_schema_text,
@@ -90,9 +91,7 @@ WATCHDOG = {
     "arm": [{"kind": "write", "address": 9, "type": "uint16", "value": "timeout"}],
 }  # fmt: skip
 
-KINDS = (
-    "must be one of ascii, ascii_tcp, bytes, bytes_tcp, frames, rtu, rtu_tcp, sensor_stream, tcp"
-)
+KINDS = f"must be one of {', '.join(LINK_KINDS)}"
 
 BROKEN: list[tuple[str, dict[str, Any], str]] = [
     ("modbus", {"verified": "yes"}, "must be partly or no if unverified lists keys"),

@@ -73,6 +73,38 @@ def test_other_blocks_are_refused(wrong):
         found.feed(wrong)
 
 
+LASER = load_profile("optoncdt_1420")
+
+
+def sixes(value):
+    """Return a distance as in the manual: six bits per byte, the lowest first."""
+    return bytes([value & 63, 64 | value >> 6 & 63, 128 | value >> 12])
+
+
+@pytest.mark.parametrize(
+    ("value", "mm"),
+    [(643, 0.0), (64877, 10.0), (32760, 5.0), (65520, 10.1), (65521, math.nan), (262077, math.nan)],
+)
+def test_distances_as_in_the_manual(value, mm):
+    """Operating Instructions of the optoNCDT 1420, 7.5.2.1; errors have numbers above 65520."""
+    found = BlockParser(LASER, LASER.inputs["distance"])
+    data = sixes(7)[1:] + sixes(99) + sixes(value)
+    for byte in data:
+        found.feed(bytes([byte]))
+    assert found.value == pytest.approx(mm, abs=2e-4, nan_ok=True)
+    assert (found.values, found.lost) == (2, 0)
+
+
+@pytest.mark.parametrize(
+    "damaged", [sixes(5)[:2], sixes(5)[1:], b"\xff", sixes(5)[:1] + b"\x00\x80"]
+)
+def test_damaged_values_on_a_serial_line_are_lost(damaged):
+    found = BlockParser(LASER, LASER.inputs["distance"])
+    found.feed(sixes(643) + damaged + sixes(64877))
+    assert found.value == pytest.approx(10.0, abs=2e-4)
+    assert (found.values, found.lost > 0) == (2, True)
+
+
 @pytest.mark.parametrize(("max_age_s", "valid"), [(60.0, True), (1e-9, False)])
 def test_an_old_reading_is_invalid(serial_bench, max_age_s, valid):
     bench = serial_bench("kepco_bop", reader="capancdt_6200", own_line=True, timeout_s=TIMEOUT_S)
