@@ -125,6 +125,7 @@ class SensorStreamSession(Session):
     def __init__(self, profile: StreamProfile, receiver: Receiver, wait_s: float) -> None:
         self._profile = profile
         self._receiver = receiver
+        self._is_line = isinstance(receiver, SerialLink)
         self._wait_s = wait_s
         self._arrived_ns = 0
 
@@ -166,19 +167,24 @@ class SensorStreamSession(Session):
         while not self._parser.values:
             if not self._receiver.wait(deadline - time.monotonic()):
                 rule = f"no block that begins with {self._profile.header.begin}"
-                line = "; compare baud" if isinstance(self._receiver, SerialLink) else ""
+                line = "; compare baud" if self._is_line else ""
                 raise NoAnswerError(f"{rule} within {self._wait_s:g} s{line}")
             self._take()
 
-    def _take(self) -> None:
+    def _take(self) -> bool:
+        """Process what has arrived; return whether there is a new value."""
         data, age_ns = self._receiver.receive()
-        if data and self._parser.feed(data):
+        is_new = bool(data) and self._parser.feed(data)
+        if is_new:
             self._arrived_ns = time.monotonic_ns() - age_ns
         self.lost = self._parser.lost
+        return is_new
 
     def _newest(self) -> float:
-        self._take()
+        is_new = self._take()
         if not self._parser.values:
             return math.nan
         self.age_s = 1e-9 * (time.monotonic_ns() - self._arrived_ns)
-        return self._parser.value if self.age_s <= self._profile.link.max_age_s else math.nan
+        # On a serial line a new value is at most as old as the last call; its age is not known.
+        is_valid = (is_new and self._is_line) or self.age_s <= self._profile.link.max_age_s
+        return self._parser.value if is_valid else math.nan

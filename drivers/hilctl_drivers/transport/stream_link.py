@@ -165,7 +165,7 @@ class StreamLink(ABC):
     def receive(self) -> tuple[bytes, int]:
         """Return received unsolicited data, without waiting, and the longest age of its end in ns.
 
-        The kernel does not report when it arrived, so the age is the time since the last call.
+        The kernel does not report its arrival, so the age is the time since the last call.
         """
         if self._fd < 0:
             raise LostError("not open")

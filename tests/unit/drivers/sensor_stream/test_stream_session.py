@@ -117,6 +117,22 @@ def test_an_old_reading_is_invalid(serial_bench, max_age_s, valid):
     bench.device.close()
 
 
+def test_a_reading_since_the_last_tick_is_valid_on_a_serial_line(serial_bench):
+    """The arrival is not known there; without new readings the age counts from the last tick."""
+    bench = serial_bench("kepco_bop", reader="optoncdt_1420", own_line=True, timeout_s=TIMEOUT_S)
+    bench.emulator.options["reader"]["max_age_s"] = 1e-9
+    options = {**bench.emulator.options, "timeout_s": TIMEOUT_S}
+    bench.device = SerialDac(SerialOptions.model_validate(options))
+    bench.open()
+    link = bench.device._reader.link
+    assert link.wait(TIMEOUT_S)
+    assert math.isfinite(bench.exchange(0.0)[0])
+    bench.emulator.reader.stalled_until_ns = 2**62
+    link.drain()
+    assert math.isnan(bench.exchange(0.0)[0])
+    bench.device.close()
+
+
 def test_a_sensor_that_is_silent_from_the_start_is_refused(serial_bench):
     bench = serial_bench("kepco_bop", reader="capancdt_6200", own_line=True, timeout_s=0.05)
     bench.emulator.reader.stalled_until_ns = 2**62
