@@ -53,12 +53,8 @@ class Dac(DacDevice):
         self._options = options
         self._setup = setup = DacSetup.of(options)
         self._chain = setup.chain
-        self._wire: Wire = resolve_name(path)(setup, link or setup.writer.link())
-        self._reader = setup.reader_on(self._wire.link)
-        self._measure: Callable[[], float] | None = None
-        if setup.measure is not None:
-            self._measure = self._wire.session.input_reader(setup.measure)
-            self._measured_by = setup.chain.measured(setup.measure)
+        self._wire_class: type[Wire] = resolve_name(path)
+        self._use(link or setup.writer.link())
         self._safe_exchange = SafeExchange()
         self._feed_every = self._ticks = 0
         self.block_max, self.block_note = self._wire.block_max, self._wire.block_note
@@ -66,6 +62,17 @@ class Dac(DacDevice):
         action = self._wire.verb.format(output=options.output, input=options.input)
         super().__init__(self._describe(), title, action, options.output)
         self.aux = self._wire.aux
+
+    def _use(self, link: Any) -> None:
+        """Use a link to the device with the output."""
+        setup = self._setup
+        self._wire = self._wire_class(setup, link)
+        self._reader = setup.reader_on(link)
+        self._measure: Callable[[], float] | None = None
+        if setup.measure is not None:
+            self._measure = self._wire.session.input_reader(setup.measure)
+            self._measured_by = setup.chain.measured(setup.measure)
+        self._read_measured = self._measure
 
     def _describe(self) -> DeviceInfo:
         options, setup, chain, wire = self._options, self._setup, self._chain, self._wire
@@ -106,7 +113,7 @@ class Dac(DacDevice):
             buffered=wire.fifo_depth > 0,
             fifo_depth=wire.fifo_depth,
             latency_blocks=late_blocks,
-            measures_command=self._measure is not None,
+            measures_command=setup.measure is not None,
             reads_output=wire.reads_output,
             safe_note="; ".join(filter(None, (self._late_note(), wire.unconfirmed))),
             confirms=not wire.unconfirmed,
@@ -184,8 +191,17 @@ class Dac(DacDevice):
         wire.start(self._reader, sample_rate_hz, block)
         wire.session.check_errors()
         self.transactions = wire.requests
-        if not wire.fifo_depth:  # otherwise the wire reads them with each block
-            self._aux_readers = self._setup.aux_readers(wire.link, self._reader.link)
+        self._begin_reading()
+
+    def _begin_reading(self) -> None:
+        """Prepare what is read besides the wire's exchange."""
+        wire, setup = self._wire, self._setup
+        self._read_measured = wire.read_measured or self._measure
+        in_turn = () if wire.fifo_depth else wire.aux_in_turn
+        self._next_aux = 0
+        self._aux_readers = [
+            (k, setup.aux_reader(k, wire.link, self._reader.link)) for k in in_turn
+        ]
 
     def _plan_feeding(self, ticks_per_s: float) -> None:
         """Plan the feeding; raise DeviceError if the exchange rate is too low for the watchdog."""
@@ -211,8 +227,12 @@ class Dac(DacDevice):
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
         self._wire.exchange(first_sample, command, displacement_um)
-        if self._measure is not None:
-            measured[0] = self._measured(self._measure)
+        self._follow_up(measured)
+
+    def _follow_up(self, measured: F64) -> None:
+        """Measure the output, and feed the watchdog."""
+        if self._read_measured is not None:
+            measured[0] = self._measured(self._read_measured)
         if self._feed_every:
             self._ticks += 1
             if self._ticks % self._feed_every == 0:

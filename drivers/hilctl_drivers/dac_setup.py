@@ -1,6 +1,6 @@
 """A DAC's options resolved against the profiles."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass, replace
 from functools import partial
 from typing import Any, Literal, Self, cast
@@ -109,13 +109,11 @@ class DacSetup:
         own = self.reads_elsewhere and not self.shares_link
         return SensorReader(self.reader, self.input, link, self.reader_name, own=own)
 
-    def aux_readers(self, link: Link, reader_link: Link) -> list[Callable[[], float]]:
-        """Return functions that read the auxiliary channels on the open links."""
-        found: list[Callable[[], float]] = []
-        for each in self.aux:
-            shared = link if each.holder is self.writer else reader_link
-            found.append(partial(each.value, SensorReader(each.holder, each.input, shared)))
-        return found
+    def aux_reader(self, k: int, link: Link, reader_link: Link) -> Callable[[], float]:
+        """Return a function that reads an auxiliary channel on the open links."""
+        aux = self.aux[k]
+        shared = link if aux.holder is self.writer else reader_link
+        return partial(aux.value, SensorReader(aux.holder, aux.input, shared))
 
     @property
     def _stepped(self) -> type[SteppedSession]:
@@ -142,16 +140,20 @@ class DacSetup:
         if timeout_s <= wire.answered_s:
             raise InputError(f"timeout_s must be > {wire.answered_s:g}, got {timeout_s:g} ({wire})")
 
-    def after_reading(self, wire: WireTime) -> WireTime:
+    def after_reading(
+        self, wire: WireTime, aux: Sequence[int] | None = None, *, digital: bool = True
+    ) -> WireTime:
         """Return the time of a sample that the reader reads and then ``wire`` writes.
 
-        It includes the slowest auxiliary channel, and setting the digital output.
+        It includes the slowest auxiliary channel of those in ``aux`` (default: all), and setting
+        the digital output.
         """
-        if self.aux:
-            times = [session_class(e.holder).read_time(e.holder.profile, e.input) for e in self.aux]
+        in_turn = self.aux if aux is None else [self.aux[k] for k in aux]
+        if in_turn:
+            times = [session_class(e.holder).read_time(e.holder.profile, e.input) for e in in_turn]
             slowest = max(times, key=lambda each: each.total_s)
             wire = wire.then(slowest.named("for an auxiliary channel"))
-        if (pulse := self.digital_time) is not None:
+        if digital and (pulse := self.digital_time) is not None:
             wire = wire.then(pulse.named(f"to set {self.options.digital_output}"))
         if not self.reads_elsewhere:
             return wire

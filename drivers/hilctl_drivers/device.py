@@ -56,8 +56,8 @@ class DacDevice(ABC):
                 self._curve = curve
         self.aux: F64 = np.full(len(info.aux), np.nan)
         """Newest values of the auxiliary channels."""
-        self._aux_readers: Sequence[Callable[[], float]] = ()
-        """Read the auxiliary channels, one per exchange in turn; empty if exchanges fill them."""
+        self._aux_readers: Sequence[tuple[int, Callable[[], float]]] = ()
+        """Auxiliary channels that are read one per exchange in turn; exchanges fill the others."""
         self._next_aux = 0
         self._digital_is_low = False
         self.safe_command = math.nan
@@ -91,15 +91,21 @@ class DacDevice(ABC):
             self._check_block(block)
             self.check_rate(sample_rate_hz, block)
             self._open(sample_rate_hz, block)
-            for _ in self._aux_readers:
-                self._read_aux()
-            # A missing channel must show before the output moves.
-            if self._info.digital_output:
-                self._set_digital(high=False)
-            if self._info.digital_input:
-                self._read_digital()
+            self._try_out_channels()
         except DeviceError as error:
             raise self._failed("open", error, self._release) from None
+        self._note_open(block)
+
+    def _try_out_channels(self) -> None:
+        """Use each channel once: a missing one must show before the output moves."""
+        for _ in self._aux_readers:
+            self._read_aux()
+        if self._info.digital_output:
+            self._set_digital(high=False)
+        if self._info.digital_input:
+            self._read_digital()
+
+    def _note_open(self, block: int) -> None:
         self._block = block
         self.transactions -= self._info.ages_readings  # no request: unsolicited samples
         self.transactions += bool(self._aux_readers)
@@ -161,26 +167,8 @@ class DacDevice(ABC):
                 self._read_aux()
         except DeviceError as error:
             raise self._failed(self._action, error, self._abandon) from None
-        self._correct(displacement_um)
-
-    def _check_blocks(self, command: F64, displacement_um: F64, measured: F64) -> None:
-        """Raise DeviceError for a block of another size, or a command out of range."""
-        block = self._block
-        if not command.size == displacement_um.size == measured.size == block or not block:
-            self._check_sizes(command, displacement_um, measured)
-        low, high = self._low, self._high
-        # Both ends are NaN for a NaN. For a few values numpy takes as long as for hundreds.
-        ends = (command.min(), command.max()) if block > _SHORT else command.tolist()
-        for value in ends:
-            if not low <= value <= high:
-                raise self._out_of_range(command)
-
-    def _correct(self, displacement_um: F64) -> None:
-        """Apply the calibration of the sensor."""
         if self._curve is not None:
-            # A reading out of range becomes an end of the corrected range, which is invalid.
-            self.reading_um = displacement_um.copy()
-            displacement_um[:] = np.interp(displacement_um, *self._curve)
+            self._correct(displacement_um, *self._curve)
 
     def set_digital(self, high: bool) -> None:
         """Set the digital output, see :meth:`hilctl.base.device.DigitalDevice.set_digital`."""
@@ -242,9 +230,15 @@ class DacDevice(ABC):
 
     def _read_aux(self) -> None:
         """Read the next auxiliary channel."""
-        k = self._next_aux
-        self.aux[k] = self._aux_readers[k]()
-        self._next_aux = (k + 1) % len(self._aux_readers)
+        k, read = self._aux_readers[self._next_aux]
+        self.aux[k] = read()
+        self._next_aux = (self._next_aux + 1) % len(self._aux_readers)
+
+    def _correct(self, displacement_um: F64, readings_um: F64, corrected_um: F64) -> None:
+        """Correct displacements by the calibration of the sensor."""
+        # A reading out of range becomes an end of the corrected range, which is invalid.
+        self.reading_um = displacement_um.copy()
+        displacement_um[:] = np.interp(displacement_um, readings_um, corrected_um)
 
     def _reset_digital(self, command: float) -> None:
         """Set the digital output low after the safe command, once, because the outcome waits."""
@@ -308,6 +302,18 @@ class DacDevice(ABC):
         if not 1 <= block <= most:
             span = "1 sample" if most == 1 else f"1 to {most} samples"
             raise DeviceError(f"block must be {span}{self.block_note}, got {block}")
+
+    def _check_blocks(self, command: F64, displacement_um: F64, measured: F64) -> None:
+        """Raise DeviceError for blocks of another size, and for a command out of range."""
+        block = self._block
+        if not command.size == displacement_um.size == measured.size == block or not block:
+            self._check_sizes(command, displacement_um, measured)
+        low, high = self._low, self._high
+        # Both ends are NaN for a NaN. For a few values numpy takes as long as for hundreds.
+        ends = (command.min(), command.max()) if block > _SHORT else command.tolist()
+        for value in ends:
+            if not low <= value <= high:
+                raise self._out_of_range(command)
 
     def _check_sizes(self, command: F64, displacement_um: F64, measured: F64) -> None:
         """Raise DeviceError for a block whose size differs from the one at open."""

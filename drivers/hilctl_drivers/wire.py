@@ -5,6 +5,7 @@ Values are in the unit of the output or input, commands in the unit of the actua
 """
 
 from abc import ABC, abstractmethod
+from collections.abc import Callable, Sequence
 from typing import Any
 
 import numpy as np
@@ -68,9 +69,19 @@ class Wire(ABC):
         self.aux: F64 = np.full(len(setup.aux), np.nan)
         """Newest values of the auxiliary channels."""
 
+        self.aux_in_turn: Sequence[int] = range(len(setup.aux))
+        """Auxiliary channels that need requests of their own, known after :meth:`start`."""
+        self.read_measured: Callable[[], float] | None = None
+        """Returns the measured output after an exchange, known after :meth:`start`; None if that
+        needs a request of its own."""
+
     @abstractmethod
     def rates(self, block: int) -> RateLimit:
         """Return the sample rates that it can keep with this block."""
+
+    def joint(self, wires: "Sequence[Wire]") -> "JointWire | None":
+        """Return the joint exchange of wires on one link to one device; None without one."""
+        return None
 
     def open(self, block_s: float = 0.0) -> list[str]:
         """Connect, identify the device, and return errors of earlier sessions.
@@ -120,13 +131,44 @@ class Wire(ABC):
             DeviceError: The device did not confirm it.
         """
 
+    def disarm(self) -> None:
+        """End the exchange, and disarm the watchdog; the output stays."""
+        if self.setup.options.watchdog != "none":
+            self.watchdog.disarm()
+
     def close(self) -> None:
         """Disarm and run the close steps; the output stays."""
         # First: nothing feeds it any more, and it would trip while the close steps run.
-        if self.setup.options.watchdog != "none":
-            self.watchdog.disarm()
+        self.disarm()
         self.session.finish()
 
     def release(self) -> None:
         """Close the link, if open, without a message to the device."""
         self.link.close()
+
+
+class JointWire(ABC):
+    """Exchange of several outputs of one device; its wires do the rest."""
+
+    requests = 1
+    """Requests of an exchange, known after :meth:`start`."""
+
+    def __init__(self, wires: Sequence[Wire]) -> None:
+        self.wires = wires
+
+    @abstractmethod
+    def rates(self, block: int) -> RateLimit:
+        """See :meth:`Wire.rates`."""
+
+    @abstractmethod
+    def start(self, readers: Sequence[SensorReader], sample_rate_hz: float, block: int) -> None:
+        """See :meth:`Wire.start`; there is a reader per wire."""
+
+    @abstractmethod
+    def exchange(
+        self, first_sample: int, commands: Sequence[F64], displacements_um: Sequence[F64]
+    ) -> None:
+        """See :meth:`Wire.exchange`; there is a block per wire."""
+
+    def release(self) -> None:  # noqa: B027  most have nothing to forget
+        """Forget what :meth:`start` has found."""

@@ -174,7 +174,7 @@ class BoardWire(Wire):
         if found is not None:
             check_read_back(output, value, found, 2.0 * output.step)
 
-    def close(self) -> None:
+    def disarm(self) -> None:
         """Stop the clock and disarm; the output holds its last value."""
         # The clock first: an output that moves must not be without its watchdog.
         if self.fifo_depth:

@@ -252,7 +252,7 @@ class LabJackWire(RegisterWire):
 
     def rates(self, block: int) -> RateLimit:
         """See :meth:`~hilctl_drivers.wire.Wire.rates`."""
-        streaming, settle_s = self._streaming, self._target.settle_s
+        streaming, settle_s = self._streaming, self.target.settle_s
         inputs, per_s = len(self._sources), streaming.samples_per_s_max
         most_hz, whose = streaming.rate_max_hz(inputs), f"{per_s:g} samples a second for"
         whose += f" {inputs} input{'s' * (inputs > 1)} and an output: its profile"
@@ -271,9 +271,9 @@ class LabJackWire(RegisterWire):
         buffer, profile = self.buffer, self._profile
         self.session.run(self._streaming.setup)
         self._calibrations = [buffer.calibration(source // 2) for source in self._sources]
-        buffer.prepare(sample_rate_hz, profile.wire_address(self._target), self._sources)
+        buffer.prepare(sample_rate_hz, profile.wire_address(self.target), self._sources)
         check_fifo(block, self._fifo_blocks, buffer.capacity)
-        self._try_out_safe_value()
+        self.try_out_safe_value()
         self._next_sample = 0
         self.requests = stream_messages(block, len(self._sources))
 
@@ -301,15 +301,15 @@ class LabJackWire(RegisterWire):
         scans = self.buffer.take(block).reshape(block, -1)
         return [each.volts(scans[:, k]) for k, each in enumerate(self._calibrations)]
 
-    def close(self) -> None:
-        """See :meth:`~hilctl_drivers.wire.Wire.close`."""
+    def disarm(self) -> None:
+        """See :meth:`~hilctl_drivers.wire.Wire.disarm`."""
         # The stream first: an output that moves must not be without its watchdog.
         self.buffer.stop()
-        super().close()
+        super().disarm()
 
     def _write(self, data: bytes) -> None:
         feedback = self.session.feedback
-        write = write_frame(self._profile.wire_address(self._target), data)
+        write = write_frame(self._profile.wire_address(self.target), data)
         # The stream first: it would write over the safe value with its next scan.
         try:
             feedback(write_frame(ENABLE, u32(0)), write)
@@ -317,7 +317,7 @@ class LabJackWire(RegisterWire):
             feedback(write)
 
     def _read_back(self) -> float:
-        output = self._target
+        output = self.target
         target = read_frame(self._profile.wire_address(output), output.words)
         running, held = self.session.feedback(read_frame(ENABLE, 2), target)
         if running != u32(0):

@@ -312,25 +312,6 @@ class ModbusProfile(BaseProfile):
         """Yield every register with its dotted key."""
         return ((key, each) for key, each in parts_of(self) if isinstance(each, Register))
 
-    def span(self, register: Register) -> tuple[int, int]:
-        """Return wire address and number of the registers that are read for one.
-
-        A validity register is read with its input if it is beside it, or a part of it.
-        """
-        at = self.wire_address(register)
-        end = at + register.words
-        validity = register.validity if isinstance(register, ModbusInput) else "none"
-        if validity != "none" and self.read_together(register, validity):
-            there = self.wire_address(validity)
-            at, end = min(at, there), max(end, there + validity.words)
-        return at, end - at
-
-    def read_together(self, one: Register, other: Register) -> bool:
-        """Return whether one request reads both registers: they touch or overlap."""
-        at, there = self.wire_address(one), self.wire_address(other)
-        near = at <= there + other.words and there <= at + one.words
-        return near and one.read_function == other.read_function
-
     def wire_address(self, register: Register) -> int:
         """Return the address that goes into the frame, 0 to 65535."""
         base = self.address_base if register.address_base is None else register.address_base

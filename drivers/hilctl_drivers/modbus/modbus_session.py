@@ -6,12 +6,11 @@ reply is parsed by :mod:`hilctl_drivers.modbus.pdu`, which raises the error.
 """
 
 import itertools
-import math
 import struct
 import time
 from collections.abc import Callable, Sequence
 from functools import partial
-from typing import Literal, TypeAlias, cast
+from typing import Literal, cast
 
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.endpoint import Endpoint
@@ -26,6 +25,14 @@ from hilctl_drivers.modbus.register_map import (
     RegisterStep,
     StatusRegister,
 )
+from hilctl_drivers.modbus.tick_plan import (
+    Call,
+    Tick,
+    TickPlan,
+    read_request,
+    requests_time,
+    write_request,
+)
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.session import SteppedSession
 from hilctl_drivers.transport.crc import MODBUS_WORDS, Bytes, crc16_modbus
@@ -38,19 +45,13 @@ from hilctl_drivers.transport.links import (
 )
 from hilctl_drivers.transport.wire_time import WireTime
 
-Call: TypeAlias = Callable[..., bytes]
-"""Send a prepared request and return the register bytes or packed bits that it reads.
-
-An argument replaces the register bytes that its PDU writes.
-"""
-
 _tcp_start = struct.Struct(">HH").unpack_from
 
 
 def _tcp_call(session: "ModbusSession", pdu: bytes) -> Call:
     """Return a function that sends a PDU by Modbus TCP, each time with the next number."""
     unit, numbers, transact = session.unit, session.numbers, session.link.transact
-    data_at, (head, read_size) = modbus.DATA_AT.get(pdu[0], len(pdu)), modbus.reply_layout(pdu)
+    data_at, (head, read_size) = modbus.data_at(pdu), modbus.reply_layout(pdu)
     own, before = pdu[data_at:], modbus.tcp_adu(0, unit, pdu)[2 : modbus.TCP_HEAD + data_at]
     echoes = pdu[0] == modbus.WRITE_REGISTER
     head = modbus.tcp_adu(0, unit, head + bytes(read_size))[2 : modbus.TCP_HEAD + len(head)]
@@ -92,7 +93,7 @@ def _rtu_call(session: "ModbusSession", pdu: bytes) -> Call:
     CRCs of constant bytes are computed once; the others two bytes at a time.
     """
     unit, transact, table = session.unit, session.link.transact, MODBUS_WORDS
-    data_at, (head, read_size) = modbus.DATA_AT.get(pdu[0], len(pdu)), modbus.reply_layout(pdu)
+    data_at, (head, read_size) = modbus.data_at(pdu), modbus.reply_layout(pdu)
     own, before = pdu[data_at:], modbus.rtu_adu(unit, pdu)[: 1 + data_at]
     echoes = pdu[0] == modbus.WRITE_REGISTER
     head = before[:1] + head
@@ -141,36 +142,6 @@ def _rtu_missing(usual: int, received: Bytes) -> int:
     return 0 if received[1] & 0x80 else max(0, usual - size)
 
 
-def read_request(profile: ModbusProfile, register: Register) -> bytes:
-    """Return the PDU that reads a register, and the validity of an input with it."""
-    return modbus.read_pdu(register.read_function, *profile.span(register))
-
-
-def write_request(profile: ModbusProfile, register: Register, data: bytes = b"") -> bytes:
-    """Return the PDU that writes a register; zeros without ``data``."""
-    address = profile.wire_address(register)
-    data = data or bytes(2 * register.words)
-    if register.type == "bit":
-        return modbus.coil_pdu(address, any(data))
-    single = register.words == 1
-    if isinstance(register, ModbusOutput):
-        single = register.function == 6
-    return (modbus.write_single_pdu if single else modbus.write_pdu)(address, data)
-
-
-def combined_request(
-    profile: ModbusProfile, output: ModbusOutput, sensor: ModbusInput
-) -> bytes | None:
-    """Return the PDU that writes an output and reads an input; None if the device has none."""
-    source, target = profile.span(sensor), profile.wire_address(output)
-    data = bytes(2 * output.words)
-    if profile.exchange == 23:
-        return modbus.write_read_pdu(*source, target, data)
-    if profile.exchange == 76:
-        return modbus.feedback_pdu(modbus.read_frame(*source), modbus.write_frame(target, data))
-    return None
-
-
 class ModbusSession(SteppedSession):
     """A link to one device, with one request at a time; every error is a ``DeviceError``."""
 
@@ -201,19 +172,19 @@ class ModbusSession(SteppedSession):
     @staticmethod
     def read_time(profile: ModbusProfile, source: ModbusInput) -> WireTime:
         """See :meth:`~hilctl_drivers.session.Session.read_time`."""
-        return _requests_time(profile, read_requests(profile, source), source.settle_s)
+        return TickPlan(profile, inputs=[source]).time
 
     @staticmethod
     def digital_time(profile: ModbusProfile, output: DigitalRegister) -> WireTime:
         """See :meth:`~hilctl_drivers.session.SteppedSession.digital_time`."""
-        return _requests_time(profile, [write_request(profile, output)])
+        return requests_time(profile, [write_request(profile, output)])
 
     @staticmethod
     def steps_time(profile: ModbusProfile, steps: Sequence[ModbusStep]) -> WireTime:
         """See :meth:`~hilctl_drivers.session.SteppedSession.steps_time`."""
         requests = [pdu for step in steps for pdu in _step_requests(profile, step)]
         waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
-        return _requests_time(profile, requests).waiting(waits_s)
+        return requests_time(profile, requests).waiting(waits_s)
 
     def prepare(self, pdu: bytes) -> Call:
         """Return a function that sends a request, and can be called many times."""
@@ -321,33 +292,16 @@ class ModbusSession(SteppedSession):
         """Return whether a bit of the flag's mask is set."""
         return flag.bits(self.read_bytes(flag)) != 0
 
-    def decoder(self, source: ModbusInput) -> Callable[[bytes], float]:
-        """Return the conversion of the bytes that :func:`read_request` reads for an input.
-
-        The value is NaN if the validity register, which may be read separately, shows that.
-        """
-        decode, validity = source.format.decode, source.validity
-        if validity == "none":
-            return decode
-        bits, valid = validity.bits, validity.valid
-        if not self.profile.read_together(source, validity):
-            request = self.prepare(read_request(self.profile, validity))
-            # Afterwards: a reading that has become invalid in between is not used.
-            return lambda data: decode(data) if bits(request()) == valid else math.nan
-
-        start, _ = self.profile.span(source)
-
-        def part(register: Register) -> slice:
-            first = 2 * (self.profile.wire_address(register) - start)
-            return slice(first, first + 2 * register.words)
-
-        own, other = part(source), part(validity)
-        return lambda data: decode(data[own]) if bits(data[other]) == valid else math.nan
-
     def input_reader(self, source: ModbusInput) -> Callable[[], float]:
         """Return a function that reads an input, NaN if it is invalid."""
-        request, decode = self.prepare(read_request(self.profile, source)), self.decoder(source)
-        return lambda: decode(request())
+        tick = self.tick(TickPlan(self.profile, inputs=[source]))
+        value = tick.reader(source)
+
+        def read() -> float:
+            tick.run(())
+            return value()
+
+        return read
 
     def set_digital(self, output: DigitalRegister, high: bool) -> None:
         """Write 1 or 0 to a digital output."""
@@ -357,29 +311,28 @@ class ModbusSession(SteppedSession):
         """Return whether a digital input is not 0."""
         return any(self.read_bytes(source))
 
+    def tick(self, plan: TickPlan) -> Tick:
+        """Return a prepared plan, which checks the error register after a write."""
+        register = self.profile.error_register
+        checks = bool(plan.outputs) and register != "none"
+        return Tick(plan, self.prepare, self._check_error if checks else None)
+
     def old_errors(self) -> list[str]:
         """Return the content of the error register if it is not 0; reading may clear it."""
+        register = self.profile.error_register
         try:
-            if (check := self.error_check()) is not None:
-                check()
+            if register != "none":
+                self._check_error(self.read_bytes(register))
         except RefusedError as error:
             return [str(error)]
         return []
 
-    def error_check(self) -> Callable[[], None] | None:
-        """Return a function that raises RefusedError if the error register is not 0, if any."""
+    def _check_error(self, content: bytes) -> None:
+        """Raise RefusedError if the content of the error register is not 0."""
         register = self.profile.error_register
-        if register == "none":
-            return None
-        request = self.prepare(read_request(self.profile, register))
-        place = f"{register.area} {register.address}"
-
-        def check() -> None:
-            found = register.bits(request())
-            if found:
-                raise RefusedError(f"the error register, {place}, holds {found:#x}", found)
-
-        return check
+        if register != "none" and (found := register.bits(content)):
+            place = f"{register.area} {register.address}"
+            raise RefusedError(f"the error register, {place}, holds {found:#x}", found)
 
 
 def _encoded(register: Register, value: float | str) -> bytes:
@@ -394,42 +347,6 @@ def _decoded(register: Register, data: bytes) -> float:
 def _named(step: RegisterStep) -> str:
     note = f" ({step.note})" if step.note else ""
     return f"{type(step).__name__.removesuffix('Step').lower()} {step.area} {step.address}{note}"
-
-
-def exchange_time(
-    profile: ModbusProfile, output: str, sensor: str | None, *, one_transaction: bool = True
-) -> WireTime:
-    """Return the time to write an output and read an input, by name; None to write only."""
-    written = profile.outputs[output]
-    write = write_request(profile, written)
-    after = []
-    if profile.error_register != "none":
-        after = [read_request(profile, profile.error_register)]
-    if sensor is None:
-        return _requests_time(profile, [write, *after], written.settle_s)
-    read = profile.inputs[sensor]
-    reads, combined = read_requests(profile, read), combined_request(profile, written, read)
-    both = [combined, *reads[1:]] if combined and one_transaction else [*reads, write]
-    return _requests_time(profile, [*both, *after], written.settle_s + read.settle_s)
-
-
-def read_requests(profile: ModbusProfile, sensor: ModbusInput) -> list[bytes]:
-    """Return the requests that read an input, and its validity if that is elsewhere."""
-    requests, validity = [read_request(profile, sensor)], sensor.validity
-    if validity != "none" and not profile.read_together(sensor, validity):
-        requests.append(read_request(profile, validity))
-    return requests
-
-
-def _requests_time(
-    profile: ModbusProfile, requests: Sequence[bytes], settle_s: float = 0.0
-) -> WireTime:
-    """Return the time of request PDUs and their replies, one after the other."""
-    what = "+".join(f"FC{pdu[0]:02d}" for pdu in requests)
-    sent = sum(len(modbus.rtu_adu(1, pdu)) for pdu in requests)
-    received = sum(modbus.reply_size(pdu) + 3 for pdu in requests)  # unit and CRC
-    count = len(requests)
-    return profile.wire_time(what, sent, received, 2 * count, count, settle_s)
 
 
 def _step_requests(profile: ModbusProfile, step: ModbusStep) -> list[bytes]:

@@ -23,9 +23,8 @@ READ_COILS, READ_DISCRETE, READ_HOLDING, READ_INPUT = 1, 2, 3, 4
 WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS, WRITE_READ = 5, 6, 16, 23
 FEEDBACK = 76
 PLAIN_WRITES = frozenset({WRITE_COIL, WRITE_REGISTER, WRITE_REGISTERS})
-DATA_AT = {WRITE_REGISTER: 3, WRITE_REGISTERS: 6, WRITE_READ: 10, FEEDBACK: 9}
-"""Start of the data to write, which are the end of the request PDU, by function."""
-
+READ_MAX = 125
+"""Registers that one request may read."""
 PDU_MAX = 253
 RTU_SHORTEST = 5
 """Bytes of the shortest RTU reply."""
@@ -88,6 +87,16 @@ def feedback_pdu(*frames: bytes) -> bytes:
     A reply has the words of each read.
     """
     return bytes((FEEDBACK,)) + b"".join(frames)
+
+
+def data_at(pdu: bytes) -> int:
+    """Return where the data to write begin in a request PDU; its length if it only reads."""
+    if pdu[0] != FEEDBACK:
+        return {WRITE_REGISTER: 3, WRITE_REGISTERS: 6, WRITE_READ: 10}.get(pdu[0], len(pdu))
+    at = 1
+    while at < len(pdu) and not pdu[at]:
+        at += FRAME_HEAD
+    return min(at + FRAME_HEAD, len(pdu))
 
 
 def reply_layout(pdu: bytes) -> tuple[bytes, int]:

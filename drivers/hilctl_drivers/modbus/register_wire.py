@@ -2,41 +2,30 @@
 
 The profile describes the registers, the experiment their wiring. A sample is one transaction if the
 device can read and write in one (function 23, or 76 on LabJack's), otherwise a read and a write;
-another device, of any protocol, may have the input. No request is repeated, and none precedes the
+another device, of any protocol, may have the input. Several outputs of one device are exchanged in
+the same requests as far as their registers allow. No request is repeated, and none precedes the
 last reply.
 """
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from dataclasses import replace
-from typing import Any, TypeAlias, cast
+from typing import Any, cast
 
 import numpy as np
 
 from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl.base.types import F64
-from hilctl_drivers.dac_setup import DacSetup
+from hilctl_drivers.dac_setup import AuxSource, DacSetup
 from hilctl_drivers.modbus.modbus_profile import ModbusInput, ModbusOutput, ModbusProfile
-from hilctl_drivers.modbus.modbus_session import (
-    ModbusSession,
-    combined_request,
-    exchange_time,
-    read_requests,
-    write_request,
-)
+from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import rtu_adu
 from hilctl_drivers.modbus.register_watchdog import RegisterWatchdog
+from hilctl_drivers.modbus.tick_plan import Tick, TickPlan, write_request
 from hilctl_drivers.session import SensorReader
 from hilctl_drivers.transport.links import NoAnswerError, RefusedError
 from hilctl_drivers.transport.safe_exchange import check_read_back, try_out
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
-from hilctl_drivers.wire import Wire
-
-Swap: TypeAlias = Callable[[bytes], float]
-"""Write register bytes to the output and return the value of the input in its unit.
-
-The input is read first, so it does not show the new output yet. Function 23 is an exception: the
-specification lets the device write first.
-"""
+from hilctl_drivers.wire import JointWire, Wire
 
 
 class RegisterWire(Wire):
@@ -47,8 +36,8 @@ class RegisterWire(Wire):
     def __init__(self, setup: DacSetup, link: Any) -> None:
         super().__init__(setup, link)
         self.session = session = ModbusSession.on(setup.writer, link)
+        self.target = target = cast(ModbusOutput, setup.output)
         self._profile: ModbusProfile = session.profile
-        self._target = target = cast(ModbusOutput, setup.output)
         self.watchdog: RegisterWatchdog = RegisterWatchdog(setup, session)
         readback = target.readback_register
         if readback is None and target.function == 6 and setup.writer.framing == "rtu":
@@ -57,119 +46,78 @@ class RegisterWire(Wire):
                 "the device cannot confirm it: on a serial line the reply to function 6 may be an "
                 "echo, and the output cannot be read back"
             )
-        # One transaction is tried at open. That moves an output that cannot be read back, so it is
-        # not tried there.
-        self._may_combine = (
-            self._profile.exchange != "none" and readback is not None and not setup.reads_elsewhere
-        )
         self.reads_output = readback is not None
         self._factors, self._encode = setup.chain.factors, target.format.encode
-        self._swap: Swap
-        self._one_transaction = self._may_combine  # as far as is known; opening it shows
-        setup.check_timeout(self._time(self._may_combine))
+        self._position: Callable[[], float]
+        self._aux: list[tuple[int, AuxSource, Callable[[], float]]] = []
+        self._own = RegisterExchange([self])
+        setup.check_timeout(self._own.time)
 
-    def _time(self, one_transaction: bool) -> WireTime:
-        """Return the time of a sample on the wire."""
-        setup, profile = self.setup, self._profile
-        own = None if setup.reads_elsewhere else setup.options.input
-        wire = exchange_time(profile, setup.options.output, own, one_transaction=one_transaction)
-        if setup.measure is not None:
-            measure = self.session.read_time(profile, setup.measure)
-            wire = wire.then(measure.named("to measure the output"))
-        return setup.after_reading(wire)
+    def joint(self, wires: Sequence[Wire]) -> JointWire:
+        """See :meth:`~hilctl_drivers.wire.Wire.joint`."""
+        return RegisterExchange(cast("Sequence[RegisterWire]", wires))
 
     def rates(self, block: int) -> RateLimit:
         """Return the rates with the present number of transactions."""
-        return self.setup.rates(self._time(self._one_transaction).then(self.setup.feed_time))
+        return self._own.rates(block)
 
     def start(self, reader: SensorReader, sample_rate_hz: float, block: int) -> None:
-        """See :meth:`~hilctl_drivers.wire.Wire.start`.
-
-        Only a test shows whether the device exchanges in one transaction, and so its highest rate.
-        """
-        if not self.setup.reads_elsewhere:
-            reader.read()  # a missing address must show before the output moves
-        swap, self._one_transaction = self._find_swap(reader)
-        self._try_out_safe_value()
-        rates = self.rates(block)
-        how = "one transaction" if self._one_transaction else "a read and a write"
-        replace(rates, note=f"{how} a sample; {rates.note}").check(sample_rate_hz)
-        self._swap = self._checked(swap)
-        self.requests = self._count_requests()
-
-    def _count_requests(self) -> int:
-        """Return the number of requests of a sample."""
-        setup, count = self.setup, 1 if self._one_transaction else 2
-        if isinstance(setup.input, ModbusInput):
-            reader = cast(ModbusProfile, setup.reader.profile)
-            count += len(read_requests(reader, setup.input)) - 1
-        if setup.measure is not None:
-            count += len(read_requests(self._profile, setup.measure))
-        return count + (self._profile.error_register != "none")
+        """See :meth:`~hilctl_drivers.wire.Wire.start`."""
+        self._own.start([reader], sample_rate_hz, block)
+        self.requests = self._own.requests
 
     def exchange(self, first_sample: int, command: F64, displacement_um: F64) -> None:
         """See :meth:`~hilctl_drivers.wire.Wire.exchange`."""
-        gain, offset, um_per_unit, offset_um = self._factors
-        request = self._encode((command.item() - offset) / gain)
-        displacement_um[0] = self._swap(request) * um_per_unit + offset_um
+        self._own.exchange(first_sample, (command,), (displacement_um,))
 
     def release(self) -> None:
         """Close the link and forget whether the device exchanges in one transaction."""
-        self._one_transaction = self._may_combine
+        self._own.release()
         super().release()
 
-    def _find_swap(self, reader: SensorReader) -> tuple[Swap, bool]:
-        """Return the exchange of a sample, and whether it is one transaction.
+    def extra_aux(self, plan: TickPlan) -> list[int]:
+        """Return the auxiliary channels that a plan does not read."""
+        setup = self.setup
+        return [
+            k
+            for k, each in enumerate(setup.aux)
+            if each.holder is not setup.writer or not plan.covers(cast(ModbusInput, each.input))
+        ]
 
-        The test of one transaction writes the present output again.
-        """
-        session = self.session
-        swap = self._combined()
-        held = None if swap is None else session.held_data(self._target)
-        if swap is not None and held is not None:
-            try:
-                swap(held)
-                return swap, True
-            except NoAnswerError:  # some devices do not answer to an unknown function
-                self.link.open()
-            except RefusedError:
-                pass
-        write = session.prepare(write_request(self._profile, self._target))
+    def bind(self, tick: Tick) -> None:
+        """Take the readings from the replies of a tick."""
+        setup, self.aux_in_turn = self.setup, self.extra_aux(tick.plan)
+        if not setup.reads_elsewhere:
+            self._position = tick.reader(cast(ModbusInput, setup.input))
+        if setup.measure is not None:
+            self.read_measured = tick.reader(setup.measure)
+        self._aux = [
+            (k, each, tick.reader(cast(ModbusInput, each.input)))
+            for k, each in enumerate(setup.aux)
+            if k not in self.aux_in_turn
+        ]
 
-        def pair(data: bytes) -> float:
-            found = reader.read()
-            write(data)
-            return found
+    def encoded(self, command: F64) -> bytes:
+        """Return the register bytes of a command."""
+        gain, offset, _, _ = self._factors
+        return self._encode((command.item() - offset) / gain)
 
-        return pair, False
+    def take(self, reading: float | None, displacement_um: F64) -> None:
+        """Fill in the displacement, from a reading of another device or else from the replies."""
+        _, _, um_per_unit, offset_um = self._factors
+        value = self._position() if reading is None else reading
+        displacement_um[0] = value * um_per_unit + offset_um
+        if self._aux:
+            self.take_aux()
 
-    def _checked(self, swap: Swap) -> Swap:
-        """Return ``swap`` followed by a check of the error register, if there is one."""
-        check = self.session.error_check()
-        if check is None:
-            return swap
-        check()  # a refused init step, or an earlier error that only an init step clears
-
-        def checked(data: bytes) -> float:
-            found = swap(data)
-            check()
-            return found
-
-        return checked
-
-    def _combined(self) -> Swap | None:
-        setup, session = self.setup, self.session
-        if setup.reads_elsewhere or not isinstance(setup.input, ModbusInput):
-            return None
-        pdu = combined_request(self._profile, self._target, setup.input)
-        if pdu is None:
-            return None
-        call, decode = session.prepare(pdu), session.decoder(setup.input)
-        return lambda data: decode(call(data))
+    def take_aux(self) -> None:
+        """Fill in the auxiliary channels that are in the replies."""
+        for k, source, read in self._aux:
+            self.aux[k] = source.scaled(read())
 
     def read(self) -> float | None:
         """See :meth:`~hilctl_drivers.wire.Wire.read`."""
-        return self.session.held(self._target)
+        return self.session.held(self.target)
 
     def look(self, reader: SensorReader) -> tuple[float, float | None]:
         """See :meth:`~hilctl_drivers.wire.Wire.look`; values show a wrong order of bytes."""
@@ -187,12 +135,12 @@ class RegisterWire(Wire):
 
     def message(self, value: float) -> bytes:
         """See :meth:`~hilctl_drivers.wire.Wire.message`."""
-        pdu = write_request(self._profile, self._target, self._encode(value))
+        pdu = write_request(self._profile, self.target, self._encode(value))
         return rtu_adu(self.session.unit, pdu)
 
     def confirm(self, value: float) -> None:
         """See :meth:`~hilctl_drivers.wire.Wire.confirm`."""
-        output, data = self._target, self._encode(value)
+        output, data = self.target, self._encode(value)
         self.watchdog.write_through(lambda: self._write(data))
         if self.unconfirmed:
             raise UnconfirmedError(f"the value was sent, but {self.unconfirmed}")
@@ -201,9 +149,9 @@ class RegisterWire(Wire):
             tolerance = max(output.step, 1e-6 * (output.max - output.min))
             check_read_back(output, value, found, tolerance)
 
-    def _try_out_safe_value(self) -> None:
+    def try_out_safe_value(self) -> None:
         """Write the held value with the message of the safe value, see :func:`try_out`."""
-        output = self._target
+        output = self.target
         data = self.session.held_data(output)
         if data is not None:
             name = f"{self.setup.options.output}, register {output.address}"
@@ -211,8 +159,118 @@ class RegisterWire(Wire):
 
     def _write(self, data: bytes) -> None:
         """Write the output's register bytes once."""
-        self.session.write_bytes(self._target, data)
+        self.session.write_bytes(self.target, data)
 
     def _read_back(self) -> float | None:
         """Return the value of the output after a safe value; None if unknown."""
         return self.read()
+
+
+class RegisterExchange(JointWire):
+    """The exchange of one or more outputs of a device."""
+
+    def __init__(self, wires: Sequence[RegisterWire]) -> None:
+        super().__init__(wires)
+        self._registers = wires
+        self._session = wires[0].session
+        # One transaction is tried at open. That moves an output that cannot be read back, so it is
+        # not tried there.
+        self._best = self._planned(combine=all(each.reads_output for each in wires))
+        self._plan = self._best  # as far as is known; opening it shows
+        self._tick: Tick
+        self._elsewhere: list[Callable[[], float] | None] = []
+
+    def _planned(self, *, combine: bool) -> TickPlan:
+        setups = [each.setup for each in self._registers]
+        aux = [(own, each) for own in setups for each in own.aux if each.holder is own.writer]
+        return TickPlan(
+            self._session.profile,
+            [each.target for each in self._registers],
+            [cast(ModbusInput, each.input) for each in setups if not each.reads_elsewhere],
+            [each.measure for each in setups if each.measure is not None],
+            [cast(ModbusInput, each.input) for _, each in aux],
+            combine,
+        )
+
+    @property
+    def time(self) -> WireTime:
+        """Time of a sample on the wire."""
+        wire = self._plan.time
+        for k, each in enumerate(self._registers):
+            wire = each.setup.after_reading(wire, each.extra_aux(self._plan), digital=k == 0)
+        return wire
+
+    def rates(self, block: int) -> RateLimit:
+        """Return the rates with the present number of transactions."""
+        setup = self._registers[0].setup
+        return setup.rates(self.time.then(setup.feed_time))
+
+    def start(self, readers: Sequence[SensorReader], sample_rate_hz: float, block: int) -> None:
+        """See :meth:`~hilctl_drivers.wire.JointWire.start`.
+
+        Only a test shows whether the device exchanges in one transaction, and so its highest rate.
+        """
+        wires = self._registers
+        self._tick = self._tested()
+        self._plan = self._tick.plan
+        for wire in wires:
+            wire.bind(self._tick)
+            wire.take_aux()
+            wire.try_out_safe_value()
+        self._elsewhere = [
+            reader.read if wire.setup.reads_elsewhere else None
+            for wire, reader in zip(wires, readers, strict=True)
+        ]
+        self.requests = len(self._plan.requests)
+        self.requests += sum(_reads_elsewhere(wire.setup) for wire in wires)
+        rates, n = self.rates(block), self.requests
+        how = f"{n} transaction{'s' * (n > 1)} a sample"
+        replace(rates, note=f"{how}; {rates.note}").check(sample_rate_hz)
+        self._tick.read()  # the test of the safe value may have left an error
+
+    def _tested(self) -> Tick:
+        """Return the tick in one transaction, or else in several.
+
+        The test of one transaction writes the present outputs again.
+        """
+        session, combined = self._session, self._best
+        usual = session.tick(self._planned(combine=False))
+        usual.read()  # a missing address must show before the output moves
+        if not combined.combined:
+            return usual
+        held = [session.held_data(each.target) for each in self._registers]
+        tick = session.tick(combined)
+        try:
+            tick.run([each for each in held if each is not None])
+        except NoAnswerError:  # some devices do not answer to an unknown function
+            session.link.open()
+        except RefusedError:
+            pass
+        else:
+            return tick
+        return usual
+
+    def exchange(
+        self, first_sample: int, commands: Sequence[F64], displacements_um: Sequence[F64]
+    ) -> None:
+        """See :meth:`~hilctl_drivers.wire.JointWire.exchange`."""
+        wires = self._registers
+        data = [wire.encoded(each) for wire, each in zip(wires, commands, strict=True)]
+        readings = [None if read is None else read() for read in self._elsewhere]
+        self._tick.run(data)
+        for wire, reading, displacement_um in zip(wires, readings, displacements_um, strict=True):
+            wire.take(reading, displacement_um)
+
+    def release(self) -> None:
+        """Forget whether the device exchanges in one transaction."""
+        self._plan = self._best
+
+
+def _reads_elsewhere(setup: DacSetup) -> int:
+    """Return the number of requests to another device that has the input."""
+    if not setup.reads_elsewhere:
+        return 0
+    if not isinstance(setup.input, ModbusInput):
+        return 1
+    profile = cast(ModbusProfile, setup.reader.profile)
+    return len(TickPlan(profile, inputs=[setup.input]).requests)

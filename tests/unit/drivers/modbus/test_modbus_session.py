@@ -8,10 +8,7 @@ import pytest
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.dac import ModbusDac, ModbusOptions
 from hilctl_drivers.emulator.options import parse_fault
-from hilctl_drivers.modbus.modbus_session import (
-    ModbusSession,
-    exchange_time,
-)
+from hilctl_drivers.modbus.modbus_session import ModbusSession
 from hilctl_drivers.modbus.pdu import (
     coil_pdu,
     feedback_pdu,
@@ -26,6 +23,7 @@ from hilctl_drivers.modbus.pdu import (
     write_single_pdu,
 )
 from hilctl_drivers.modbus.register_map import EnsureStep, ExpectStep, WriteStep
+from hilctl_drivers.modbus.tick_plan import TickPlan
 from hilctl_drivers.profile import load_profile, parse_profile, with_link
 from hilctl_drivers.profile_base import WaitStep
 from hilctl_drivers.transport import links
@@ -239,6 +237,12 @@ def rtu(baud=115200, parity="N", **link):
     """Return a Modbus RTU device on a line, which exchanges in one transaction in no time."""
     fast = acme().model_copy(update={"exchange": 23, "turnaround_s": 0.0})
     return with_link(fast, baud=baud, parity=parity, **link)
+
+
+def exchange_time(profile, output, sensor, *, one_transaction=True):
+    """Return the time to write an output and to read an input, by name; None to write only."""
+    inputs = [] if sensor is None else [profile.inputs[sensor]]
+    return TickPlan(profile, [profile.outputs[output]], inputs, combine=one_transaction).time
 
 
 def wire_s(time):

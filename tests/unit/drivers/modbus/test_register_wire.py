@@ -148,7 +148,7 @@ class TestExchange:
 
     def test_slower_way_may_be_too_slow(self, serve):
         device = serve("labjack_t7", lacking=frozenset({76})).running(500.0)
-        with pytest.raises(DeviceError, match=r"\(0, 500\] Hz \(a read and a write a sample; "):
+        with pytest.raises(DeviceError, match=r"\(0, 500\] Hz \(2 transactions a sample; "):
             device.open(501.0, 1)
 
     def test_output_that_can_not_be_read_is_not_tried(self, serve):
@@ -500,6 +500,37 @@ class TestAux:
             made.exchange(4.0)
             found.append(device.aux.tolist())
         assert found == [[0.0, 1.0], [4.0, 1.0], [4.0, 9.0]]
+
+    @pytest.mark.parametrize(("profile", "inputs"), [
+        ("labjack_t7", ("AIN2", "AIN3")),
+        ("wago_750", ("AI1", "AI0")),
+        ("beckhoff_bk9000", ("AI1", "AI0")),
+    ])  # fmt: skip
+    def test_channels_of_the_output_s_device_are_read_in_its_one_transaction(
+        self, serve, profile, inputs
+    ):
+        aux = {f"aux{k}_v": {"input": each} for k, each in enumerate(inputs)}
+        served = serve(profile)
+        alone, device = served.device(), served.running(aux=aux)
+        assert device.info.details["transactions"] == "1"
+        assert device.info.max_rate_hz == alone.info.max_rate_hz
+        device.aux[:] = np.nan
+        exchange(device, 1.0)
+        assert np.isfinite(device.aux).all()
+        device.close()
+
+    def test_channels_and_the_measured_output_share_a_span(self, driven, variant):
+        measure = TestMeasure.INPUT.replace("address: 8", "address: 4") % "V"
+        inputs = self.INPUTS.replace("20", "6").replace("21", "7")
+        profile = variant((END, f"max: 10.0}}{measure}{inputs}\nwatchdog"))
+        made = driven(profile, aux=dict(self.AUX), measure="MON")
+        made.open()
+        made.link.requests.clear()
+        measured = np.full(1, np.nan)
+        made.device.exchange(0, np.array([3.0]), np.empty(1), measured)
+        assert [each[7] for each in made.link.requests] == [23]
+        assert measured == pytest.approx([3.0])
+        assert made.device.aux.tolist() == pytest.approx([3.0, 7.0])
 
     @pytest.mark.parametrize(("changes", "words"), [
         ({"aux": {"coil_c": {"input": "AIN99"}}}, r"aux.coil_c.input.*AIN2.*LabJack T7.*'AIN99'"),
