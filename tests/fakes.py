@@ -472,7 +472,7 @@ class InProcess:
     def stream(self, options):
         """Return a modbus_stream on this device and in its time."""
         device = ModbusStream(options, self.link)
-        buffer = device._wire.buffer
+        buffer = device.wire.buffer
         buffer.sleep, buffer.clock = self.time.sleep, self.time
         return device
 

@@ -6,13 +6,14 @@ and a serial line is drained after a timeout.
 """
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Mapping, Sequence
+from contextlib import ExitStack
 from dataclasses import replace
 from pkgutil import resolve_name
 from typing import Any, ClassVar
 
-from hilctl.base.device import DeviceInfo, DeviceOptions, DeviceReadings
-from hilctl.base.errors import InputError
+from hilctl.base.device import Device, DeviceInfo, DeviceOptions, DeviceReadings
+from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.types import F64
 from hilctl_drivers.dac_setup import DacSetup
 from hilctl_drivers.device import DacDevice, details_of
@@ -22,7 +23,7 @@ from hilctl_drivers.transport.safe_exchange import SafeExchange
 from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.wire_time import RateLimit, check_feeds
-from hilctl_drivers.wire import Wire
+from hilctl_drivers.wire import JointWire, Wire
 
 _PROMPT_S = 0.2
 """A longer delay of the safe value is mentioned in ``safe_note``."""
@@ -54,28 +55,49 @@ class Dac(DacDevice):
         self._setup = setup = DacSetup.of(options)
         self._chain = setup.chain
         self._wire_class: type[Wire] = resolve_name(path)
-        self._use(link or setup.writer.link())
+        self.use(self.wire_on(link or setup.writer.link()))
         self._safe_exchange = SafeExchange()
-        self._feed_every = self._ticks = 0
-        self.block_max, self.block_note = self._wire.block_max, self._wire.block_note
+        self._feed_every = self._ticks = self._next_aux = 0
+        self.block_max, self.block_note = self.wire.block_max, self.wire.block_note
         title = f"{self.KIND} {setup.writer.name} at {setup.writer.place}"
-        action = self._wire.verb.format(output=options.output, input=options.input)
+        action = self.wire.verb.format(output=options.output, input=options.input)
         super().__init__(self._describe(), title, action, options.output)
-        self.aux = self._wire.aux
+        self.aux = self.wire.aux
 
-    def _use(self, link: Any) -> None:
-        """Use a link to the device with the output."""
-        setup = self._setup
-        self._wire = self._wire_class(setup, link)
-        self._reader = setup.reader_on(link)
+    def use(self, wire: Wire) -> None:
+        """Use a wire and its link."""
+        setup, self.wire, self.aux = self._setup, wire, wire.aux
+        self.reader = setup.reader_on(wire.link)
         self._measure: Callable[[], float] | None = None
+        self._measured_by = 1.0, 0.0
         if setup.measure is not None:
-            self._measure = self._wire.session.input_reader(setup.measure)
+            self._measure = wire.session.input_reader(setup.measure)
             self._measured_by = setup.chain.measured(setup.measure)
         self._read_measured = self._measure
 
+    def join(self, devices: Mapping[str, Device]) -> "JointDac | None":
+        """See :meth:`hilctl.base.device.JoinableDevice.join`."""
+        place, link = self.place, self.wire.link
+        dacs = {
+            name: each
+            for name, each in devices.items()
+            if isinstance(each, type(self)) and each.place == place
+        }
+        wires = [each.wire_on(link) for each in dacs.values()]
+        joint = wires[0].joint(wires) if len(wires) > 1 else None
+        return None if joint is None else JointDac(dacs, joint)
+
+    @property
+    def place(self) -> tuple[tuple[str, ...], int | None]:
+        """Address of the device with the output, and its unit there."""
+        return self._setup.writer.holds, self._setup.writer.unit
+
+    def wire_on(self, link: Link) -> Wire:
+        """Return a new wire on a link."""
+        return self._wire_class(self._setup, link)
+
     def _describe(self) -> DeviceInfo:
-        options, setup, chain, wire = self._options, self._setup, self._chain, self._wire
+        options, setup, chain, wire = self._options, self._setup, self._chain, self.wire
         writer, reader, rates = setup.writer, setup.reader, wire.rates(wire.block_max)
         description = f"{writer.profile.title} at {writer.place}: {options.output}"
         details = writer.profile.provenance()
@@ -123,7 +145,7 @@ class Dac(DacDevice):
             identity=writer.identity(held),
             output=f"{unit}{getattr(setup.output, 'address', options.output)}",
             details=details,
-            ages_readings=self._reader.session.AGES,
+            ages_readings=self.reader.session.AGES,
             aux=tuple(each.channel for each in setup.aux),
             digital_output=options.digital_output or "",
             digital_output_s=0.0 if (pulse := setup.digital_time) is None else pulse.total_s,
@@ -139,11 +161,11 @@ class Dac(DacDevice):
             "watchdog_command": watchdog.safe_command,
             "watchdog_timeout_s": watchdog.timeout_s,
             "watchdog_reason": watchdog.reason,
-            "arm_s": self._wire.watchdog.arm_s,
+            "arm_s": self.wire.watchdog.arm_s,
         }
 
     def _late_note(self) -> str:
-        message_s = self._wire.longest_message_s
+        message_s = self.wire.longest_message_s
         if message_s <= _PROMPT_S:
             return ""
         timeout_s = self._options.watchdog_timeout_s
@@ -155,26 +177,26 @@ class Dac(DacDevice):
     @property
     def port_identity(self) -> str:
         """See :class:`hilctl.base.device.PortDevice`; empty on TCP."""
-        link = self._wire.link
+        link = self.wire.link
         return link.identity.known if isinstance(link, SerialLink) else ""
 
     @port_identity.setter
     def port_identity(self, known: str) -> None:
-        if isinstance(self._wire.link, SerialLink):
-            self._wire.link.identity.known = known
+        if isinstance(self.wire.link, SerialLink):
+            self.wire.link.identity.known = known
 
     @property
     def reading_age_s(self) -> float:
         """See :attr:`hilctl.base.device.AgingDevice.reading_age_s`."""
-        return self._reader.session.age_s
+        return self.reader.session.age_s
 
     @property
     def lost_readings(self) -> int:
         """See :attr:`hilctl.base.device.AgingDevice.lost_readings`."""
-        return self._reader.session.lost
+        return self.reader.session.lost
 
     def _rates(self, block: int) -> RateLimit:
-        return self._wire.rates(block)
+        return self.wire.rates(block)
 
     def _open(self, sample_rate_hz: float, block: int) -> None:
         """Connect, clean up after an earlier run, run the init steps, read once, test the output.
@@ -182,26 +204,31 @@ class Dac(DacDevice):
         The order matters: a tripped device refuses steps, and a wrong input must be detected before
         the output can move.
         """
-        wire = self._wire
+        wire = self.wire
         self._plan_feeding(sample_rate_hz / block)
         self._connect(block / sample_rate_hz if wire.fifo_depth else 0.0)
         wire.recover()
         wire.session.set_up()
-        self._reader.begin()
-        wire.start(self._reader, sample_rate_hz, block)
+        self.reader.begin()
+        wire.start(self.reader, sample_rate_hz, block)
         wire.session.check_errors()
         self.transactions = wire.requests
         self._begin_reading()
 
+    def take_part(self, requests: int, *, feeds: bool) -> None:
+        """Take part in a joint exchange with that many requests; ``feeds`` the watchdog or not."""
+        self._begin_reading()
+        self.transactions = requests
+        self._note_transactions()
+        if not feeds:
+            self._feed_every = 0
+
     def _begin_reading(self) -> None:
         """Prepare what is read besides the wire's exchange."""
-        wire, setup = self._wire, self._setup
+        wire, setup = self.wire, self._setup
         self._read_measured = wire.read_measured or self._measure
         in_turn = () if wire.fifo_depth else wire.aux_in_turn
-        self._next_aux = 0
-        self._aux_readers = [
-            (k, setup.aux_reader(k, wire.link, self._reader.link)) for k in in_turn
-        ]
+        self._aux_readers = [(k, setup.aux_reader(k, wire.link, self.reader.link)) for k in in_turn]
 
     def _plan_feeding(self, ticks_per_s: float) -> None:
         """Plan the feeding; raise DeviceError if the exchange rate is too low for the watchdog."""
@@ -212,31 +239,38 @@ class Dac(DacDevice):
 
     def _connect(self, block_s: float = 0.0) -> None:
         """Connect, verify the identity of the devices, and note earlier errors."""
-        if errors := self._wire.open(block_s):
+        if errors := self.wire.open(block_s):
             details = {**self._info.details, "earlier_errors": "; ".join(errors)}
             self._info = replace(self._info, details=details)
-        self._reader.open()
+        self.reader.open()
 
     def _arm(self) -> None:
         if self._options.watchdog != "none":
-            self._wire.watchdog.arm()
-            self._wire.session.check_errors()
-        self._reader.session.start()
+            self.wire.watchdog.arm()
+            self.wire.session.check_errors()
+        self.reader.session.start()
 
     def _exchange(
         self, first_sample: int, command: F64, displacement_um: F64, measured: F64
     ) -> None:
-        self._wire.exchange(first_sample, command, displacement_um)
+        self.wire.exchange(first_sample, command, displacement_um)
         self._follow_up(measured)
 
+    def complete(self, displacement_um: F64, measured: F64) -> None:
+        """Complete a joint exchange; raise DeviceError without the name of the device."""
+        self._follow_up(measured)
+        self._correct(displacement_um)
+
     def _follow_up(self, measured: F64) -> None:
-        """Measure the output, and feed the watchdog."""
+        """Measure the output, feed the watchdog, and read an auxiliary channel."""
         if self._read_measured is not None:
             measured[0] = self._measured(self._read_measured)
         if self._feed_every:
             self._ticks += 1
             if self._ticks % self._feed_every == 0:
-                self._wire.watchdog.feed()
+                self.wire.watchdog.feed()
+        if self._aux_readers:
+            self._read_aux()
 
     def _measured(self, measure: Callable[[], float]) -> float:
         """Return the command as measured."""
@@ -244,34 +278,34 @@ class Dac(DacDevice):
         return measure() * gain + offset
 
     def _output(self) -> float | None:
-        held = self._wire.read()
+        held = self.wire.read()
         return None if held is None else self._chain.command(held)
 
     def _look(self) -> DeviceReadings:
         self._connect()
         chain, measure = self._chain, self._measure
-        reading, held = self._wire.look(self._reader)
+        reading, held = self.wire.look(self.reader)
         command = None if held is None else chain.command(held)
         measured = math.nan if measure is None else self._measured(measure)
-        tripped = self._wire.watchdog.tripped()
+        tripped = self.wire.watchdog.tripped()
         return DeviceReadings(chain.displacement_um(reading), command, measured, tripped)
 
     def _set_digital(self, high: bool) -> None:
-        self._wire.session.set_digital(self._setup.digital_output, high=high)
+        self.wire.session.set_digital(self._setup.digital_output, high=high)
 
     def _read_digital(self) -> bool:
-        return self._wire.session.is_high(self._setup.digital_input)
+        return self.wire.session.is_high(self._setup.digital_input)
 
     def _abandon(self) -> None:
         """Keep a serial port: opening it again could reset a board before its output is safe.
 
         The reader is kept too, because the safe value must not wait until its port is closed.
         """
-        self._wire.link.doubt()
+        self.wire.link.doubt()
 
     def _put_out(self, command: float) -> None:
         # No self-test, no init steps, no reader: none of them may prevent the safe value.
-        value, wire, link = self._chain.output(command), self._wire, self._wire.link
+        value, wire, link = self._chain.output(command), self.wire, self.wire.link
         if isinstance(link, StreamLink):
             self._safe_exchange.attempt(
                 link, lambda: link.send_now(wire.message(value)), lambda: wire.confirm(value)
@@ -281,13 +315,84 @@ class Dac(DacDevice):
             wire.confirm(value)
 
     def _close(self) -> None:
-        self._wire.close()
-        self._reader.end()
-        self._wire.session.check_errors()
+        self.wire.close()
+        self.reader.end()
+        self.wire.session.check_errors()
 
     def _release(self) -> None:
-        self._wire.release()
-        self._reader.release()
+        self.wire.release()
+        self.reader.release()
+
+
+class JointDac:
+    """Outputs of one device, exchanged at once; see :class:`hilctl.base.device.JointDevice`.
+
+    Args:
+        dacs: The devices by name of their axes.
+        joint: The joint exchange of new wires of theirs, on one link.
+    """
+
+    def __init__(self, dacs: Mapping[str, Dac], joint: JointWire) -> None:
+        self.axes = tuple(dacs)
+        self._dacs = tuple(dacs.values())
+        self._joint = joint
+        rates = joint.rates(self._dacs[0].block_max)
+        self.max_rate_hz, self.rate_note = rates.highest_hz, rates.note
+
+    def check_rate(self, sample_rate_hz: float, block: int) -> None:
+        """See :meth:`hilctl.base.device.Device.check_rate`."""
+        self._joint.rates(block).check(sample_rate_hz)
+
+    def open(self, sample_rate_hz: float, block: int) -> None:
+        """See :meth:`hilctl.base.device.JointDevice.open`.
+
+        Each device sets itself up, and tests its output, on the one link.
+        """
+        self.close()
+        first, joint = self._dacs[0], self._joint
+        self.check_rate(sample_rate_hz, block)
+        try:
+            for dac, wire in zip(self._dacs, joint.wires, strict=True):
+                dac.use(wire)
+                dac.open(sample_rate_hz, block)
+            try:
+                joint.start([each.reader for each in self._dacs], sample_rate_hz, block)
+            except DeviceError as error:
+                raise first.open_failed(error) from None
+        except DeviceError as error:
+            for dac in self._dacs:
+                dac.open_failed(error)
+            raise
+        for dac in self._dacs:
+            dac.take_part(joint.requests, feeds=dac is first)
+
+    def exchange(
+        self,
+        first_sample: int,
+        commands: Sequence[F64],
+        displacements_um: Sequence[F64],
+        measured: Sequence[F64],
+    ) -> None:
+        """See :meth:`hilctl.base.device.JointDevice.exchange`."""
+        dacs = self._dacs
+        for dac, *blocks in zip(dacs, commands, displacements_um, measured, strict=True):
+            dac.check_blocks(*blocks)
+        try:
+            self._joint.exchange(first_sample, commands, displacements_um)
+            for dac, displacement_um, found in zip(dacs, displacements_um, measured, strict=True):
+                dac.complete(displacement_um, found)
+        except DeviceError as error:
+            errors = [each.exchange_failed(error) for each in dacs]
+            raise errors[0] from None
+
+    def close(self) -> None:
+        """See :meth:`hilctl.base.device.JointDevice.close`."""
+        self._joint.release()
+        with ExitStack() as stack:  # in reverse order: all leave before the link is closed
+            for dac in self._dacs:
+                stack.callback(dac.close)
+            for dac in self._dacs:
+                stack.callback(dac.leave)
 
 
 class SerialOptions(DacOptions):

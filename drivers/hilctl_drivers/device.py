@@ -93,8 +93,9 @@ class DacDevice(ABC):
             self._open(sample_rate_hz, block)
             self._try_out_channels()
         except DeviceError as error:
-            raise self._failed("open", error, self._release) from None
-        self._note_open(block)
+            raise self.open_failed(error) from None
+        self._block = block
+        self._note_transactions()
 
     def _try_out_channels(self) -> None:
         """Use each channel once: a missing one must show before the output moves."""
@@ -105,8 +106,7 @@ class DacDevice(ABC):
         if self._info.digital_input:
             self._read_digital()
 
-    def _note_open(self, block: int) -> None:
-        self._block = block
+    def _note_transactions(self) -> None:
         self.transactions -= self._info.ages_readings  # no request: unsolicited samples
         self.transactions += bool(self._aux_readers)
         if self.transactions:
@@ -160,15 +160,12 @@ class DacDevice(ABC):
         A block is rejected before anything is sent if its size differs from the one at open, or a
         command is out of range or not finite.
         """
-        self._check_blocks(command, displacement_um, measured)
+        self.check_blocks(command, displacement_um, measured)
         try:
             self._exchange(first_sample, command, displacement_um, measured)
-            if self._aux_readers:
-                self._read_aux()
         except DeviceError as error:
-            raise self._failed(self._action, error, self._abandon) from None
-        if self._curve is not None:
-            self._correct(displacement_um, *self._curve)
+            raise self.exchange_failed(error) from None
+        self._correct(displacement_um)
 
     def set_digital(self, high: bool) -> None:
         """Set the digital output, see :meth:`hilctl.base.device.DigitalDevice.set_digital`."""
@@ -219,14 +216,19 @@ class DacDevice(ABC):
 
         After an error in an exchange the connection is already closed, and a watchdog stays armed.
         """
+        try:
+            self.leave()
+        finally:
+            self._release()
+
+    def leave(self) -> None:
+        """Disarm an open device, but keep the connection for another output."""
         opened, self._block = self._block != 0, 0
         try:
             if opened:
                 self._close()
         except DeviceError as error:
             raise self._error("close", str(error)) from None
-        finally:
-            self._release()
 
     def _read_aux(self) -> None:
         """Read the next auxiliary channel."""
@@ -234,11 +236,12 @@ class DacDevice(ABC):
         self.aux[k] = read()
         self._next_aux = (self._next_aux + 1) % len(self._aux_readers)
 
-    def _correct(self, displacement_um: F64, readings_um: F64, corrected_um: F64) -> None:
-        """Correct displacements by the calibration of the sensor."""
-        # A reading out of range becomes an end of the corrected range, which is invalid.
-        self.reading_um = displacement_um.copy()
-        displacement_um[:] = np.interp(displacement_um, readings_um, corrected_um)
+    def _correct(self, displacement_um: F64) -> None:
+        """Correct displacements by the calibration of the sensor, if there is one."""
+        if self._curve is not None:
+            # A reading out of range becomes an end of the corrected range, which is invalid.
+            self.reading_um = displacement_um.copy()
+            displacement_um[:] = np.interp(displacement_um, *self._curve)
 
     def _reset_digital(self, command: float) -> None:
         """Set the digital output low after the safe command, once, because the outcome waits."""
@@ -303,7 +306,7 @@ class DacDevice(ABC):
             span = "1 sample" if most == 1 else f"1 to {most} samples"
             raise DeviceError(f"block must be {span}{self.block_note}, got {block}")
 
-    def _check_blocks(self, command: F64, displacement_um: F64, measured: F64) -> None:
+    def check_blocks(self, command: F64, displacement_um: F64, measured: F64) -> None:
         """Raise DeviceError for blocks of another size, and for a command out of range."""
         block = self._block
         if not command.size == displacement_um.size == measured.size == block or not block:
@@ -326,6 +329,14 @@ class DacDevice(ABC):
 
     def _error(self, action: str, what: str) -> DeviceError:
         return DeviceError(f"{self._title}: {what} (to {action})")
+
+    def open_failed(self, error: DeviceError) -> DeviceError:
+        """Close the connection, and return the error with device and action."""
+        return self._failed("open", error, self._release)
+
+    def exchange_failed(self, error: DeviceError) -> DeviceError:
+        """Abandon the connection, and return the error with device and action."""
+        return self._failed(self._action, error, self._abandon)
 
     def _failed(self, action: str, error: DeviceError, give_up: Callable[[], None]) -> DeviceError:
         """Abandon the connection and return the error with device and action."""

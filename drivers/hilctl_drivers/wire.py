@@ -88,7 +88,8 @@ class Wire(ABC):
 
         An answer may take ``block_s`` longer than the timeout, if the device's clock sets the pace.
         """
-        self.link.open()
+        if not self.link.is_open:  # another output may have opened it
+            self.link.open()
         self.session.identify()
         return self.session.old_errors()
 
@@ -162,7 +163,7 @@ class JointWire(ABC):
 
     @abstractmethod
     def start(self, readers: Sequence[SensorReader], sample_rate_hz: float, block: int) -> None:
-        """See :meth:`Wire.start`; there is a reader per wire."""
+        """Prepare the exchange after each wire has started; there is a reader per wire."""
 
     @abstractmethod
     def exchange(

@@ -379,11 +379,11 @@ def test_attempts_at_a_silent_board_wait_for_no_boot_and_cause_none(board):
     """Each attempt opens the port and keeps the control lines that would reset the board."""
     device = board(dead, boot_wait_s=2.0)
     slept = []
-    device._wire.link._sleep = slept.append
+    device.wire.link._sleep = slept.append
     for _ in range(3):
         with pytest.raises(DeviceError, match="no answer"):
             device.make_safe(SAFE)
-        assert not device._wire.link.is_open
+        assert not device.wire.link.is_open
         descriptor = os.open(device.info.holds[0].partition(":")[2], os.O_RDWR | os.O_NOCTTY)
         assert not termios.tcgetattr(descriptor)[2] & termios.HUPCL
         os.close(descriptor)

@@ -15,6 +15,7 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from hilctl.base.device import joined
 from hilctl.base.errors import DeviceError
 from hilctl_drivers.dac import ModbusDac, ModbusOptions
 from tests.peers.conftest import read_line, running, serial_cable
@@ -325,3 +326,30 @@ def test_death_of_the_server_is_an_error_within_the_time_out(start, name):
         with pytest.raises(DeviceError, match="make safe"):
             device.make_safe(0.0)
         assert time.monotonic() - before_s < HANG_S
+
+
+def test_outputs_exchanged_at_once_are_those_exchanged_one_by_one(served):
+    """Two outputs in one exchange leave the registers, and return the readings, of two devices."""
+    kinds, volts, commands = ("SWAPPED", "FLOAT"), (-7.5, 4.125), (3.5, -11.0)
+    for kind, value in zip(kinds, volts, strict=True):
+        served.put(kind, value)
+    alone = []
+    for kind, command in zip(kinds, commands, strict=True):
+        device = served.device(kind, kind)
+        device.open(RATE_HZ, 1)
+        alone += exchange(device, command)
+        device.close()
+    held = [served.get(kind) for kind in kinds]
+    devices = {kind: served.device(kind, kind) for kind in kinds}
+    joint = joined(devices)[kinds]
+    joint.open(RATE_HZ, 1)
+    found = np.full((3, 2, 1), np.nan)
+    for values in ((0.0, 0.0), commands):
+        found[0, :, 0] = values
+        joint.exchange(0, [*found[0]], [*found[1]], [*found[2]])
+    requests = {device.info.details["transactions"] for device in devices.values()}
+    joint.close()
+    assert requests == {"1" if served.server.writes_and_reads else "2"}
+    assert found[1, :, 0].tolist() == alone
+    assert [served.get(kind) for kind in kinds] == held
+    assert held == pytest.approx([(each - 1.0) / 2.0 for each in commands])

@@ -197,7 +197,7 @@ class SentBlocks:
         All blocks of before the previous exchange have arrived. On a serial line the age is an
         upper bound, so that the block is one of those since.
         """
-        arrived_ns = device._reader.session._arrived_ns
+        arrived_ns = device.reader.session._arrived_ns
         at_ns = arrived_ns + round(1e9 * device.reading_age_s)
         assert before_ns <= at_ns + 1
         assert at_ns <= time.monotonic_ns() + 1

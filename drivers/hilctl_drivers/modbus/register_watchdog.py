@@ -1,7 +1,8 @@
 """Host watchdog of a Modbus device, set by the steps of its profile."""
 
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from functools import partial
 from typing import cast
 
 from hilctl.base.errors import DeviceError
@@ -22,6 +23,8 @@ class RegisterWatchdog(HostWatchdog):
         self._target = cast(ModbusOutput, setup.output)
         profile: ModbusProfile = session.profile
         self._has = profile.watchdog
+        self.joined: Sequence[RegisterWatchdog] = (self,)
+        """The watchdogs of the outputs that a run drives; their device has one."""
         self.arm_s = session.arm_s(profile, setup.options.output)
 
     def arm(self) -> None:
@@ -60,20 +63,30 @@ class RegisterWatchdog(HostWatchdog):
 
     def recover(self) -> None:
         """End a trip with the output unchanged; raise DeviceError if a step fails."""
-        has, output = self._has, self._target
+        has = self._has
         if has == "none" or not has.clear or not self._is_tripped(has):
             return
         if has.on_trip == "hold":
             self._clear(has)
             return
-        value = self._trip_value(has)
+        # Of all outputs: each would return to its last command when the trip is cleared.
+        writes = [each.trip_write(has) for each in self.joined]
+
+        def put() -> None:
+            for write in writes:
+                write()
+
+        self.write_through(put)
+
+    def trip_write(self, has: ModbusWatchdog) -> Callable[[], None]:
+        """Return a function that writes the output of a tripped device once more."""
+        value, output = self._trip_value(has), self._target
         if value is None:
             raise DeviceError(
                 "its watchdog has tripped and the output is unknown: "
                 "'hilctl safe' puts it at the safe value and clears the trip"
             )
-        data = output.format.encode(value)
-        self.write_through(lambda: self._session.write_bytes(output, data))
+        return partial(self._session.write_bytes, output, output.format.encode(value))
 
     def _is_tripped(self, has: ModbusWatchdog) -> bool:
         output, session = self._target, self._session

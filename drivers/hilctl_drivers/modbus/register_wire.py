@@ -173,6 +173,8 @@ class RegisterExchange(JointWire):
         super().__init__(wires)
         self._registers = wires
         self._session = wires[0].session
+        for wire in wires:
+            wire.watchdog.joined = [each.watchdog for each in wires]
         # One transaction is tried at open. That moves an output that cannot be read back, so it is
         # not tried there.
         self._best = self._planned(combine=all(each.reads_output for each in wires))

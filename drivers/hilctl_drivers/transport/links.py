@@ -45,6 +45,10 @@ class LostError(DeviceError):
 class Link(Protocol):
     """A connection to a device."""
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it is open, as far as is known."""
+
     def open(self) -> None:
         """Connect; raise LostError if no device answers, or the port is in use."""
 

@@ -60,6 +60,11 @@ class _Connection:
         self._socket = made
         return made
 
+    @property
+    def is_open(self) -> bool:
+        """Whether it is open, as far as is known."""
+        return self._socket is not None
+
     def close(self) -> None:
         """Close the connection."""
         if self._socket is not None:

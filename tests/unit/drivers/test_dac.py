@@ -312,7 +312,7 @@ def test_a_line_that_never_falls_silent_gets_the_safe_value(rig, kind):
     bench = rig(kind, timeout_s=SILENCE_S)
     bench.open()
     bench.exchange(2.0)
-    link = bench.device._wire.link
+    link = bench.device.wire.link
     # As where somebody keeps sending: the line is never found quiet.
     link._stale = True
 

@@ -134,7 +134,7 @@ def test_the_device_keeps_the_pace(driven):
     before = made.time()
     made.hold(1.0, 50)
     assert made.time() - before == pytest.approx(50 * BLOCK / RATE_HZ, rel=0.01)
-    assert made.device._wire.buffer.level_min > (FIFO_BLOCKS - 1.1) * BLOCK
+    assert made.device.wire.buffer.level_min > (FIFO_BLOCKS - 1.1) * BLOCK
     assert made.clock.underruns == 0
 
 
@@ -301,7 +301,7 @@ def test_safe_is_a_stopped_stream_and_an_output_that_holds(
     driven, monkeypatch, running, held_v, holds
 ):
     """Each alone is not: a running stream writes over the output with its next scan."""
-    wire = driven().device._wire
+    wire = driven().device.wire
     wire._write = lambda data: None
     encoded = wire.setup.output.format.encode(held_v)
     answer = [stream.u32(running), encoded]

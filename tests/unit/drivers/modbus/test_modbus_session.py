@@ -169,7 +169,7 @@ class TestReader:
         served = serve("adam_6224", "agilent_34970a")
         device = served.running(5.0)
         exchange(device, 1.0)
-        reader, released = device._reader, []
+        reader, released = device.reader, []
         served.emulator.wires[1].devices = []
         reader.link.timeout_s = 0.2
         reader.release = lambda: released.append(served.events()[-1]["current_a"])

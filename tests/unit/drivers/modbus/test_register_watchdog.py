@@ -224,7 +224,7 @@ def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
     made.link.late_s = late_s
     with pytest.raises(DeviceError, match="no answer"):
         made.exchange(4.0)
-    wire = made.device._wire
+    wire = made.device.wire
     write = wire._write
 
     def written_over(data):
@@ -241,7 +241,7 @@ def test_a_value_that_is_written_over_is_not_confirmed(driven, late_s):
 def test_a_step_of_the_output_is_no_other_value(driven):
     """Which of two neighbours a device rounds to is its own affair; floats round to a millionth."""
     for profile in ("adam_6024", "generic_float32"):
-        wire = driven(profile).device._wire
+        wire = driven(profile).device.wire
         output = wire.setup.output
         step = output.step or 1e-6 * (output.max - output.min)
         assert step > 0.0
