@@ -56,11 +56,19 @@ DATA_HEAD: Final = struct.Struct(">HHHH")
 _FLOAT_BYTES = 4
 _U32_WORDS = 2
 
-# One message reads data and the buffer's state, and then writes values and takes them into use.
-VALUES_MAX: Final = (PDU_MAX - 1 - 4 * FRAME_HEAD - 4) // _FLOAT_BYTES
-"""Values that one message brings."""
-SAMPLES_MAX: Final = (PDU_MAX - 1 - 2 * _U32_WORDS - DATA_HEAD.size) // 2
-"""Samples that one message fetches."""
+
+def values_max(outputs: int = 1) -> int:
+    """Return the values per output that one message brings."""
+    # It reads data and the state of each buffer, and then writes values and takes them into use.
+    frames = 1 + 3 * outputs
+    room = PDU_MAX - 1 - frames * FRAME_HEAD - outputs * 2 * _U32_WORDS
+    return room // (outputs * _FLOAT_BYTES)
+
+
+def samples_max(outputs: int = 1) -> int:
+    """Return the samples that one message fetches."""
+    return (PDU_MAX - 1 - outputs * 2 * _U32_WORDS - DATA_HEAD.size) // 2
+
 
 STATUS: Final = {
     2940: "its buffer of readings was full: it drops scans",
@@ -76,36 +84,38 @@ f32 = struct.Struct(">f").pack
 """Register bytes of a number."""
 
 
-READ_FRAMES: Final = (
-    read_frame(DATA_CR, DATA_HEAD.size // 2 + SAMPLES_MAX),
-    read_frame(OUT_BUFFER_STATUS, _U32_WORDS),
-)
-"""First frames of each message of a run: the state before its own values."""
+def read_frames(outputs: int = 1) -> tuple[bytes, ...]:
+    """Return the first frames of each message of a run: the state before its own values."""
+    states = (read_frame(OUT_BUFFER_STATUS + 2 * k, _U32_WORDS) for k in range(outputs))
+    return read_frame(DATA_CR, DATA_HEAD.size // 2 + samples_max(outputs)), *states
 
 
-def value_frames(values: F64) -> tuple[bytes, bytes]:
-    """Return the frames that queue float64[n] values, n at most :data:`VALUES_MAX`."""
-    data = values.astype(">f4").tobytes()
-    return write_frame(OUT_BUFFER_F32, data), write_frame(OUT_SET_LOOP, u32(USE_AT_ONCE))
+def value_frames(values: F64) -> list[bytes]:
+    """Return the frames that queue float64[outputs, n], n at most :func:`values_max`."""
+    frames = []
+    for k, each in enumerate(values.astype(">f4")):
+        frames.append(write_frame(OUT_BUFFER_F32 + 2 * k, each.tobytes()))
+        frames.append(write_frame(OUT_SET_LOOP + 2 * k, u32(USE_AT_ONCE)))
+    return frames
 
 
-def stream_data(data: bytes, free: bytes) -> tuple[npt.NDArray[np.uint16], int, int]:
-    """Return the content of the answers to :data:`READ_FRAMES`, or raise if scans were lost.
+def stream_data(data: bytes) -> tuple[npt.NDArray[np.uint16], int]:
+    """Return the content of ``DATA_CR``, or raise DeviceError if scans were lost.
 
     Returns:
-        uint16[n], readings of the oldest scans; scans left in the device; values that still fit
-        into the output's buffer.
+        uint16[n], readings of the oldest scans; readings left in the device.
     """
     count, backlog_bytes, status, more = DATA_HEAD.unpack_from(data)
     if status:
         text = STATUS.get(status, "stream status {}")
         raise DeviceError(text.format(more if status in STATUS else status))
-    if count > SAMPLES_MAX:
-        raise MismatchError(f"{count} samples in a reply with room for {SAMPLES_MAX}")
+    room = (len(data) - DATA_HEAD.size) // 2
+    if count > room:
+        raise MismatchError(f"{count} samples in a reply with room for {room}")
     raw = np.frombuffer(data, ">u2", count, DATA_HEAD.size).astype(np.uint16)
     if (raw == MISSING).any():
         raise DeviceError("scans are missing from the stream")
-    return raw, backlog_bytes // BYTES_A_SAMPLE, int.from_bytes(free, "big")
+    return raw, backlog_bytes // BYTES_A_SAMPLE
 
 
 @dataclass(frozen=True, slots=True)

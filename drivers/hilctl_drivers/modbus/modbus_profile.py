@@ -67,9 +67,9 @@ class LabJackStreaming(StrictModel):
         """Samples that the output's buffer holds."""
         return self.buffer_bytes // BYTES_A_SAMPLE
 
-    def rate_max_hz(self, inputs: int) -> float:
-        """Return the highest scan rate with one output and some inputs in the scan list, Hz."""
-        return self.samples_per_s_max / (1 + inputs)
+    def rate_max_hz(self, inputs: int, outputs: int = 1) -> float:
+        """Return the highest scan rate with some inputs and outputs in the scan list, Hz."""
+        return self.samples_per_s_max / (outputs + inputs)
 
 
 GAP_CHARS = 3.5

@@ -12,7 +12,6 @@ from hilctl.base.errors import DeviceError, InputError
 from hilctl_drivers.dac import ModbusStream, ModbusStreamOptions
 from hilctl_drivers.labjack import stream
 from hilctl_drivers.labjack.labjack_wire import StreamSession, stream_time
-from hilctl_drivers.labjack.stream import VALUES_MAX
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.terfenol import TerfenolActuator, TerfenolParameters
 from tests.fakes import T7_OPTIONS, FaultyLink, InProcess, InProcessLink, logged
@@ -321,7 +320,8 @@ def test_options_that_do_not_stream_are_refused(changes, text):
 
 
 @pytest.mark.parametrize(
-    ("block", "messages"), [(1, 2), (VALUES_MAX, 2), (VALUES_MAX + 1, 3), (10 * VALUES_MAX, 11)]
+    ("block", "messages"),
+    [(1, 2), (58, 2), (59, 3), (580, 11)],
 )
 def test_a_block_costs_its_messages_and_one_that_waits(block, messages):
     profile = load_profile("labjack_t7")
@@ -355,7 +355,7 @@ class Scripted:
         written = [(address_of(each), each[4:]) for each in frames if each[0]]
         self.written += [(address, data.hex()) for address, data in written]
         self.fed += sum(len(data) // 4 for at, data in written if at == stream.OUT_BUFFER_F32)
-        if frames[0] is not stream.READ_FRAMES[0]:
+        if frames[0] != stream.read_frames()[0]:
             return [self.register(address_of(each)) for each in frames if not each[0]]
         self.calls += 1
         count, backlog, held = self.answers.pop(0)
@@ -389,8 +389,8 @@ def scene():
         session = StreamSession(
             device, profile.streaming, 0.1, turnaround_s, slept_s.append, lambda: sum(slept_s)
         )
-        session.prepare(STREAM_HZ, DAC0, [AIN0])
-        session.feed(np.zeros(queued))
+        session.prepare(STREAM_HZ, [DAC0], [AIN0])
+        session.feed(np.zeros((1, queued)))
         return Scene(session, device, slept_s)
 
     return of
@@ -477,8 +477,8 @@ def test_readings_of_the_stream_before_are_forgotten(scene):
     made.session.take(10)
     made.session.stop()
     made.device.fed = 0
-    made.session.prepare(STREAM_HZ, DAC0, [AIN0])
-    made.session.feed(np.zeros(100))
+    made.session.prepare(STREAM_HZ, [DAC0], [AIN0])
+    made.session.feed(np.zeros((1, 100)))
     made.session.start()
     assert made.session.take(10).tolist() == list(range(50, 60))
 

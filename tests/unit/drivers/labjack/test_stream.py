@@ -34,22 +34,26 @@ def test_addresses_are_the_documented_ones():
 
 def test_values_go_into_the_buffer_and_are_taken_into_use():
     """Big-endian floats at 4400, then 1 at 4070."""
-    pdu = feedback_pdu(*stream.value_frames(np.array([1.0, 2.5])))
+    pdu = feedback_pdu(*stream.value_frames(np.array([[1.0, 2.5]])))
     assert pdu == bytes.fromhex("4c 01 1130 04 3f800000 40200000 01 0fe6 02 00000001")
 
 
-def test_a_message_is_as_long_as_it_may_be():
+@pytest.mark.parametrize(("outputs", "values", "samples", "rest"), [
+    (1, 58, 120, 0), (2, 27, 118, 0), (4, 11, 114, 8),
+])  # fmt: skip
+def test_a_message_is_as_long_as_it_may_be(outputs, values, samples, rest):
     """58 values and 120 readings fill a message of 253 bytes."""
-    assert (stream.VALUES_MAX, stream.SAMPLES_MAX) == (58, 120)
-    full = [*stream.READ_FRAMES, *stream.value_frames(np.zeros(stream.VALUES_MAX))]
-    assert len(feedback_pdu(*full)) == reply_size(feedback_pdu(*full)) == 253
+    assert (stream.values_max(outputs), stream.samples_max(outputs)) == (values, samples)
+    frames = [*stream.read_frames(outputs), *stream.value_frames(np.zeros((outputs, values)))]
+    pdu = feedback_pdu(*frames)
+    assert (len(pdu), reply_size(pdu)) == (253 - rest, 253)
 
 
-def test_data_tell_readings_backlog_and_room():
+def test_data_tell_readings_and_backlog():
     data = words(3, 40, 0, 0, 100, 200, 300) + bytes(20)
-    raw, backlog, free = stream.stream_data(data, stream.u32(8000))
+    raw, backlog = stream.stream_data(data)
     assert raw.tolist() == [100, 200, 300]
-    assert (backlog, free) == (20, 8000)
+    assert backlog == 20
 
 
 @pytest.mark.parametrize(("head", "text"), [
@@ -64,12 +68,12 @@ def test_data_tell_readings_backlog_and_room():
 def test_a_stream_that_lost_something_is_an_error_in_words(head, text):
     """Every status but 0 ends the stream, and so does the mark of a dropped scan."""
     with pytest.raises(DeviceError, match=text):
-        stream.stream_data(words(*head) + bytes(240), stream.u32(0))
+        stream.stream_data(words(*head) + bytes(240))
 
 
 def test_more_samples_than_asked_for_are_no_answer():
     with pytest.raises(MismatchError, match=r"121 samples .* 120"):
-        stream.stream_data(words(121, 0, 0, 0) + bytes(240), stream.u32(0))
+        stream.stream_data(words(121, 0, 0, 0) + bytes(240))
 
 
 def test_t7_readings_have_a_slope_on_each_side_of_the_centre():
