@@ -165,7 +165,7 @@ class SimulatedDevice(DacDevice):
 
         The caller advances the plant, then calls :meth:`end_block`.
         """
-        self._check_blocks(command, displacement_um, measured)
+        self.check_blocks(command, displacement_um, measured)
         try:
             return self._skipped_before(first_sample, command.size)
         except DeviceError as error:
