@@ -103,6 +103,7 @@ class FakeInfo:
     ages_readings: bool = False
     corrects_readings: bool = False
     simulated: bool = False
+    holds: tuple = ()
     confirms: bool = True
     arm_s: float = 0.0
     aux: tuple = ()
@@ -257,7 +258,9 @@ class FakeHost:
     def record_event(self, event):
         self.events.append(event)
 
-    def writing_safe(self, value):
+    unanswered = False
+
+    def note_safe_write(self, value, unanswered):
         self.safe_writes.append(value)
 
     def column(self, row):

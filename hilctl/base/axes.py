@@ -1,8 +1,9 @@
 """The ``axes`` section: one experiment per axis, its keys laid over those of the file."""
 
 import re
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import replace
+from typing import TypeVar
 
 from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.formatting import did_you_mean
@@ -14,6 +15,8 @@ MAX_AXES = 8
 RUN_KEYS = {"name", "description", "labels", "sample_rate_hz", "block", "coupling", "trigger",
             "apart", "timing", "recording", "realtime"}  # fmt: skip
 """Keys of an experiment that are the same for all axes."""
+
+_T = TypeVar("_T")
 
 
 def names_text(names: Sequence[str]) -> str:
@@ -51,6 +54,23 @@ def axis_documents(document: Document) -> dict[str, Document]:
     for part in [*parts.values()][1:]:
         part.remove("trigger")  # its marks and channels are those of the first axis
     return parts
+
+
+def of_each_axis(document: Document, made: Callable[[str, Document], _T]) -> dict[str, _T]:
+    """Return what a function makes of the name and document of each axis, by name.
+
+    Raise ConfigError with the problems of all axes.
+    """
+    found, problems = dict[str, _T](), dict[str, Sequence[ConfigProblem]]()
+    for axis, part in axis_documents(document).items():
+        problems[axis] = ()
+        try:
+            found[axis] = made(axis, part)
+        except ConfigError as error:
+            problems[axis] = error.problems
+    if any(problems.values()):
+        raise ConfigError(problems_of_axes(problems))
+    return found
 
 
 def one_axis_document(document: Document) -> Document:

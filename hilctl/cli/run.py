@@ -7,7 +7,7 @@ import signal
 import subprocess
 import sys
 import time
-from collections.abc import Callable, Iterator, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict
 from itertools import zip_longest
@@ -38,7 +38,7 @@ from hilctl.run.control.client import finish_dead_runs
 from hilctl.run.result import Progress as RunProgress
 from hilctl.run.result import RunResult
 from hilctl.run.run_folder import facts_of, require_linux
-from hilctl.run.safety.manual_safe import put_safe
+from hilctl.run.safety.manual_safe import SafeResult, put_safe
 from hilctl.run.start import start_detached
 
 _log = logging.getLogger(__name__)
@@ -183,17 +183,33 @@ def _forecast_mapping(checked: CheckedExperiment) -> dict[str, Any]:
 
 
 def safe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
-    """Set a device to its safe value (refused while a run uses it)."""
+    """Set the device of each axis to its safe value (refused while a run uses one)."""
     require_linux()
-    put = put_safe(experiment, settings or [])
-    confirmed = put.output == "confirmed"
-    text = f"{put.device}: {describe(put.output, put.error)} ({put.value:g} {put.unit})"
-    if put.guardian_active and not confirmed:
-        text += "\nThe guardian of the last run is still retrying: see hilctl status."
-    stream = sys.stdout if confirmed else sys.stderr
-    print_result(put.to_mapping(), lambda: print(text, file=stream), as_json=as_json)
+    axes = put_safe(experiment, settings or [])
+    confirmed = all(put.output == "confirmed" for put in axes.values())
+    print_result(_safe_mapping(axes), lambda: _print_safe(axes), as_json=as_json)
     if not confirmed:
         raise typer.Exit(3)
+
+
+def _safe_mapping(axes: Mapping[str, SafeResult]) -> dict[str, Any]:
+    """Return the results of setting the safe values as plain values."""
+    results = {name: put.to_mapping() for name, put in axes.items()}
+    if "" in results:
+        return results[""]
+    safe = all(each["output_safe"] for each in results.values())
+    active = any(each["guardian_active"] for each in results.values())
+    return {"output_safe": safe, "guardian_active": active, "axes": results}
+
+
+def _print_safe(axes: Mapping[str, SafeResult]) -> None:
+    for name, put in axes.items():
+        text = f"{put.device}: {describe(put.output, put.error)} ({put.value:g} {put.unit})"
+        stream = sys.stdout if put.output == "confirmed" else sys.stderr
+        print(f"{name}: {text}" if name else text, file=stream)
+    if any(put.guardian_active for put in axes.values()):
+        text = "The guardian of the last run is still retrying: see hilctl status."
+        print(text, file=sys.stderr)
 
 
 @contextmanager

@@ -11,13 +11,7 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from hilctl.base.axes import (
-    AXIS_NAME,
-    axis_documents,
-    one_axis_document,
-    problems_of_axes,
-    with_settings,
-)
+from hilctl.base.axes import AXIS_NAME, of_each_axis, one_axis_document, with_settings
 from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
 from hilctl.base.files import TextFiles, is_file
@@ -115,17 +109,9 @@ def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperimen
 def load_axes(path: Path, settings: Sequence[str] = ()) -> tuple[LoadedExperiment, ...]:
     """Load an experiment file with one axis or several, see :func:`load_experiment`."""
     document = with_settings(load_document(path), _from_here(path, settings))
-    files, loaded = TextFiles(), []
-    problems: dict[str, Sequence[ConfigProblem]] = {}
-    for axis, part in axis_documents(document).items():
-        problems[axis] = ()
-        try:
-            loaded.append(_resolved(part, path.parent, files, axis))
-        except ConfigError as error:
-            problems[axis] = error.problems
-    if any(problems.values()):
-        raise ConfigError(problems_of_axes(problems))
-    return tuple(loaded)
+    files = TextFiles()
+    loaded = of_each_axis(document, lambda axis, part: _resolved(part, path.parent, files, axis))
+    return tuple(loaded.values())
 
 
 def input_files(document: Document, path: Path) -> list[Path]:

@@ -110,12 +110,6 @@ class CheckedExperiment:
         moves = config.feedback is not None or config.adaptation is not None
         return own or moves or config.measures_offset
 
-    @property
-    def silence(self) -> SilenceLimits:
-        """Longest silence of the loop before it counts as hung."""
-        config, info = self.loaded.config, self.loaded.device.info
-        return silence_limits(config.timing, config.tick_s, simulated=info.simulated)
-
     def conditioning(self) -> Conditioning | None:
         """Return the conditioning before the waveform, or None."""
         return self.loaded.conditioning(self.begun.stands_um)
@@ -164,6 +158,17 @@ class CheckedRun:
     def names(self) -> list[str]:
         """Names of the axes; one empty name if there is only one."""
         return [each.loaded.axis for each in self.axes]
+
+    @property
+    def simulated(self) -> bool:
+        """Whether the devices of all axes are simulated."""
+        return all(each.loaded.device.info.simulated for each in self.axes)
+
+    @property
+    def silence(self) -> SilenceLimits:
+        """Longest silence of the loop before it counts as hung."""
+        config = self.config
+        return silence_limits(config.timing, config.tick_s, simulated=self.simulated)
 
     @property
     def holds(self) -> tuple[str, ...]:

@@ -18,7 +18,7 @@ from hilctl.loop.interlocks import Interlocks, Trip
 from hilctl.loop.lead_in import LeadIn
 from hilctl.loop.limiter import Limiter
 from hilctl.loop.plan import AxisPlan, Lane
-from hilctl.loop.safe_output import SafeGoal
+from hilctl.loop.safe_output import SafeGoal, SafeOutput
 from hilctl.loop.tuning import ReferenceTuner, Tuning, TuningFactors, tune
 
 # Plain integers: access to an enumeration's member takes longer than the write.
@@ -197,6 +197,7 @@ class AxisChain:
 
     def begin_exchange(self, late_ns: int) -> Block:
         """Write the lateness of an exchange; return the block whose answer it brings."""
+        self.lane.unanswered = True
         head, in_flight = self.block.head, self._in_flight
         # The wake-up alone would not show a delay due to the work of this tick.
         head[_LATE_NS] = max(head[_LATE_NS], late_ns)
@@ -206,6 +207,7 @@ class AxisChain:
         """Write the duration of an exchange, and the readings that the device has as attributes."""
         in_flight = self._in_flight
         self.block.head[_EXCHANGE_NS] = duration_ns
+        self.lane.unanswered = False
         for name in self._attributes:
             getattr(answered, name)[:] = getattr(self.device, name)
         early = len(in_flight) <= self._latency_blocks
@@ -286,11 +288,12 @@ class AxisChain:
             values = {"readings": float(lost)}
             self.lane.record_event(Event(sample, "warning", LOST_READINGS, text, values))
 
-    def safe_goal(self) -> SafeGoal:
-        """Return the ramp from the last command to the safe value after a lost device."""
-        limits = self.limiter.limits
-        unanswered = not self.device.info.simulated
-        return SafeGoal(limits.safe, limits.ramp_per_s, self.limiter.last, unanswered)
+    def safe_output(self, began_s: float, clock: Callable[[], float]) -> SafeOutput:
+        """Return the ramp from the last command to the safe value, which begins at ``began_s``."""
+        limits, device = self.limiter.limits, self.device
+        unanswered = self.lane.unanswered and not device.info.simulated
+        goal = SafeGoal(limits.safe, limits.ramp_per_s, self.limiter.last, unanswered)
+        return SafeOutput(device, goal, began_s, clock, self.lane.note_safe_write)
 
     def pass_on_unanswered(self) -> None:
         """Pass on the blocks of a lost device, marked as unanswered."""

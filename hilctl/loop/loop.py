@@ -27,8 +27,8 @@ from hilctl.loop.safe_output import (
     LoopOutcome,
     OutputState,
     describe,
-    drive_all_to_safe,
-    joint_state,
+    drive_to_safe,
+    joint_report,
 )
 from hilctl.loop.triggers import PulseOutput
 
@@ -407,22 +407,24 @@ class Loop:
         self._exchange(due=False)
 
     def _lost_device(self, error: DeviceError) -> LoopOutcome:
-        text = str(error) if self._code == "completed" else f"{self._reason}; then {error}"
-        self._record_event(Event(self._next_sample, "error", "device_lost", str(error)))
+        # Those in whose exchange it failed; none if a watchdog or a pulse did.
+        lost = [each for each in self._chains if each.lane.unanswered]
+        said = lost[0].named(str(error)) if lost else str(error)
+        for chain in () if lost else self._chains:
+            chain.lane.unanswered = True
+        text = said if self._code == "completed" else f"{self._reason}; then {said}"
+        self._record_event(Event(self._next_sample, "error", "device_lost", said))
         last = max(0, self._ended_at - 1)
         for chain in self._chains:
             chain.record_lost_readings(last)
         # Before the devices are used: their timeouts would look like a hang to the supervisor.
         self._host.closing()
         # The outputs first: the samples are safe in shared memory.
-        outputs = drive_all_to_safe(
-            self._devices,
-            [each.safe_goal() for each in self._chains],
-            self._seconds,
-            self._sleep,
-            [each.lane.writing_safe for each in self._chains],
-        )
-        state, why = joint_state(outputs, [each.plan.name for each in self._chains])
+        began_s = self._seconds()
+        outputs = [each.safe_output(began_s, self._seconds) for each in self._chains]
+        drive_to_safe(outputs, self._sleep)
+        reports = [each.report for each in outputs]
+        state, why, _ = joint_report(reports, [each.plan.name for each in self._chains])
         if state != "confirmed":
             text += f"; {describe(state, why)}"
         for chain in self._chains:

@@ -82,7 +82,13 @@ class LoopPlan:
 
 
 class Lane(Protocol):
-    """Source and destination of the blocks and events of one axis."""
+    """Source and destination of the blocks and events of one axis.
+
+    Attributes:
+        unanswered: Whether the device may still execute a command that it has not answered.
+    """
+
+    unanswered: bool
 
     def claim(self, *, due: bool = True) -> Block:
         """Return the next block; a spare slot if it is not due, or if the ring is full.
@@ -99,7 +105,7 @@ class Lane(Protocol):
         """Pass a block on to be recorded; return False if it was in a spare slot."""
         ...
 
-    def writing_safe(self, value: float) -> None:
+    def note_safe_write(self, value: float, unanswered: bool) -> None:
         """Publish a write of the safe ramp, so that another process can continue the ramp."""
         ...
 

@@ -5,11 +5,12 @@ writes (:meth:`hilctl.base.device.Device.make_safe`) and never retries.
 """
 
 import errno
+import threading
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from dataclasses import dataclass
-from typing import Literal, TypeAlias, cast
+from typing import Literal, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
 from hilctl.base.device import Device, DigitalDevice
 from hilctl.base.errors import DeviceError, UnconfirmedError
@@ -96,84 +97,109 @@ class SafeGoal:
     pending: bool
 
 
+class OutputReport(NamedTuple):
+    """State of one output, or of several together.
+
+    Attributes:
+        error: Why it is not confirmed; may be empty.
+        final: Whether further writes cannot change it.
+    """
+
+    state: OutputState
+    error: str
+    final: bool
+
+    @property
+    def settled(self) -> bool:
+        """Whether waiting gains nothing: the guardian watches a value that is only set."""
+        return self.final or self.state == "set"
+
+
 class SafeOutput:
-    """Drive one device to its safe value; call :meth:`attempt` until :attr:`final`.
+    """Drive one device to its safe value; :func:`drive_in_turn` calls :meth:`attempt`.
 
     The ramp is a function of time, so a slow device gets fewer and larger steps.
 
     Args:
         device: Open or not.
         goal: The safe value and the ramp to it.
+        began_s: Time at which the ramp begins, common to all outputs of a run.
         clock: Monotonic time in s.
-        on_write: Called with each value before it is written.
+        note: Called before and after each write, with the value, and with whether a command may
+            still be executed later.
 
     Attributes:
-        state: State of the output.
-        error: Why it is not confirmed; empty if the last write succeeded.
+        report: State of the output.
+        due_s: Time of the next attempt.
+        pause_s: Pause before it, s.
     """
 
     def __init__(
         self,
         device: Device,
         goal: SafeGoal,
+        began_s: float,
         clock: Callable[[], float] = time.monotonic,
-        on_write: Callable[[float], None] = lambda value: None,
+        note: Callable[[float, bool], None] = lambda value, unanswered: None,
     ) -> None:
-        self._device, self._goal = device, goal
+        self.device, self.clock = device, clock
+        self._goal, self._note = goal, note
         if device.info.digital_output:
             # Not with the first write, because the safe ramp must not wait for it.
             cast(DigitalDevice, device).safe_command = goal.value
-        self._clock, self._on_write = clock, on_write
-        self.pending = goal.pending
-        """Whether an older command without an answer may still be executed."""
-        self._began_s: float | None = None
+        self._pending = goal.pending
+        self._began_s = began_s - _RAMP_S
         self._sends = 0
-        self.pause_s = 0.0
-        """Pause before the next attempt, s."""
-        self.state: OutputState = "unknown"
-        self.error = "nothing was sent"
+        self.pause_s, self.due_s = 0.0, began_s
+        self.report = OutputReport("unknown", "nothing was sent", final=False)
 
     @property
-    def final(self) -> bool:
-        """Whether further writes cannot change the state."""
-        return self.state == "confirmed" or (self.state == "sent" and self._sends >= _SENDS)
+    def give_up_s(self) -> float:
+        """Time until which a command waits for the confirmation."""
+        goal = self._goal
+        ramp_s = 0.0 if goal.start is None else abs(goal.start - goal.value) / goal.ramp_per_s
+        return self._began_s + _RAMP_S + ramp_s + PATIENCE_S
 
     def attempt(self) -> None:
-        """Write once; update state, error and pause.
+        """Write once; update the report and the time of the next attempt.
 
         Raise LocalError if this process lacks memory or descriptors.
         """
-        now_s = self._clock()
-        if self._began_s is None:
-            self._began_s = now_s - _RAMP_S
-        passed_s = now_s - self._began_s
-        value, least_s = (
-            self._value(passed_s),
-            PATIENT_PAUSE_S if passed_s > PATIENT_AFTER_S else 0.0,
-        )
-        confirmed = True
-        self._on_write(value)
+        passed_s = self.clock() - self._began_s
+        value = self._value(passed_s)
         try:
-            self._device.make_safe(value)
+            self._write(value, passed_s)
+        finally:
+            self._note(value, self._pending)
+            self.due_s = self.clock() + self.pause_s
+
+    def _write(self, value: float, passed_s: float) -> None:
+        least_s = PATIENT_PAUSE_S if passed_s > PATIENT_AFTER_S else 0.0
+        at_goal, confirmed = value == self._goal.value, True
+        # Until it is answered, a step of the ramp may be executed after later ones.
+        self._note(value, self._pending or not at_goal)
+        try:
+            self.device.make_safe(value)
         except UnconfirmedError:
             confirmed = False
         except DeviceError as error:
-            if _is_local(error):
-                raise LocalError(str(error)) from error
-            self.state, self.error = "unknown", str(error)
+            local = _is_local(error)
+            self._pending |= not at_goal and not local
             self.pause_s = _RETRY_S if passed_s <= PATIENCE_S else max(_LATER_RETRY_S, least_s)
-            # The device may execute this command later, after the next one.
-            self.pending |= value != self._goal.value
+            self.report = OutputReport("unknown", str(error), final=False)
+            if local:
+                self.pause_s = _RAMP_S
+                raise LocalError(str(error)) from error
             return
-        if value != self._goal.value:
-            self.state, self.error, self.pause_s = "unknown", "on the safe ramp", _RAMP_S
+        if not at_goal:
+            self.pause_s = _RAMP_S
+            self.report = OutputReport("unknown", "on the safe ramp", final=False)
             return
-        self.error, self.pause_s = "", max(_REPEAT_S, least_s)
-        if confirmed:
-            self.state = "set" if self.pending else "confirmed"
-        else:
-            self._sends += 1
-            self.state = "sent"
+        self.pause_s = max(_REPEAT_S, least_s)
+        self._sends += not confirmed
+        state: OutputState = "sent" if not confirmed else "set" if self._pending else "confirmed"
+        final = self._sends >= _SENDS if state == "sent" else state == "confirmed"
+        self.report = OutputReport(state, "", final)
 
     def _value(self, passed_s: float) -> float:
         goal = self._goal
@@ -185,71 +211,110 @@ class SafeOutput:
         return min(goal.value, goal.start + step)
 
 
-def drive_to_safe(
-    device: Device,
-    goal: SafeGoal,
-    clock: Callable[[], float] = time.monotonic,
-    sleep: Callable[[float], None] = time.sleep,
-    on_write: Callable[[float], None] = lambda value: None,
-) -> SafeOutput:
-    """Write until the state is final or set, at most :data:`PATIENCE_S` longer than the ramp.
+def drive_in_turn(
+    outputs: Sequence[SafeOutput],
+    is_over: Callable[[], bool],
+    wait: Callable[[float], object],
+    spare: Callable[[], bool] = lambda: True,
+) -> None:
+    """Attempt each output when it is due, until all are final.
 
     Args:
-        device: Open or not.
-        goal: The safe value and the ramp to it.
-        clock: Monotonic time in s.
-        sleep: Waits that many s.
-        on_write: Called with each value before it is written.
+        outputs: Those of one line, see :func:`lines_of`.
+        is_over: Called after each attempt; returns True to end.
+        wait: Waits that many s; returns True to end.
+        spare: Called if this process lacks memory or descriptors; returns False to give up, which
+            raises LocalError.
     """
-    output = SafeOutput(device, goal, clock, on_write)
-    ramp_s = 0.0 if goal.start is None else abs(goal.start - goal.value) / goal.ramp_per_s
-    give_up_s = clock() + ramp_s + PATIENCE_S
-    while True:
+    while left := [each for each in outputs if not each.report.final]:
+        output = min(left, key=lambda each: each.due_s)
+        pause_s = output.due_s - output.clock()
+        if pause_s > 0.0 and wait(pause_s):
+            return
         try:
             output.attempt()
-        except LocalError as error:
-            output.error, output.pause_s = str(error), _RETRY_S
-        # The guardian watches a value that is set but not confirmed.
-        if output.final or output.state == "set" or clock() >= give_up_s:
-            return output
-        sleep(output.pause_s)
+        except LocalError:
+            if not spare():
+                raise
+        if is_over():
+            return
+
+
+class _Driven(Protocol):
+    @property
+    def device(self) -> Device: ...
+
+
+_D = TypeVar("_D", bound=_Driven)
+
+
+def lines_of(driven: Iterable[_D]) -> list[list[_D]]:
+    """Return what has a device, by lines.
+
+    Devices that share a resource are on one line: they are used in turn, so that no two connections
+    collide. Other devices do not wait for each other's timeouts.
+    """
+    lines: list[tuple[set[str], list[_D]]] = []
+    for each in driven:
+        holds, line = set(each.device.info.holds), [each]
+        for other in [other for other in lines if other[0] & holds]:
+            lines.remove(other)
+            holds, line = holds | other[0], other[1] + line
+        lines.append((holds, line))
+    return [line for _, line in lines]
+
+
+def drive_to_safe(
+    outputs: Sequence[SafeOutput], sleep: Callable[[float], None] = time.sleep
+) -> None:
+    """Drive outputs to their safe values, the lines at the same time.
+
+    Ends if all outputs of a line are final or set, and at most :data:`PATIENCE_S` after the ramp.
+
+    Args:
+        outputs: Those of all axes.
+        sleep: Waits that many s.
+    """
+    ending = threading.Event()
+
+    def drive(line: Sequence[SafeOutput]) -> None:
+        give_up_s = max(each.give_up_s for each in line)
+
+        def is_over() -> bool:
+            settled = all(each.report.settled for each in line)
+            return settled or ending.is_set() or line[0].clock() >= give_up_s
+
+        drive_in_turn(line, is_over, sleep)
+
+    lines = lines_of(outputs)
+    if len(lines) == 1:
+        drive(lines[0])
+        return
+    with ThreadPoolExecutor(len(lines)) as threads:
+        try:
+            for each in [threads.submit(drive, line) for line in lines]:
+                each.result()
+        finally:
+            ending.set()  # Ctrl-C
 
 
 _WORST: tuple[OutputState, ...] = ("unknown", "sent", "set", "confirmed")
 
 
-def joint_state(outputs: Sequence[SafeOutput], names: Sequence[str]) -> tuple[OutputState, str]:
-    """Return the worst state of several outputs, and why those outputs are not confirmed."""
-    state = min((each.state for each in outputs), key=_WORST.index)
-    whys = [
-        f"{name}: {each.error}" if name and each.error else each.error
-        for each, name in zip(outputs, names, strict=True)
-        if each.state == state
-    ]
-    return state, "; ".join(filter(None, whys))
+def joint_report(reports: Sequence[OutputReport], names: Sequence[str]) -> OutputReport:
+    """Return the worst state of several outputs, with the names of those not confirmed.
 
-
-def drive_all_to_safe(
-    devices: Sequence[Device],
-    goals: Sequence[SafeGoal],
-    clock: Callable[[], float],
-    sleep: Callable[[float], None],
-    on_writes: Sequence[Callable[[float], None]],
-) -> list[SafeOutput]:
-    """Drive each device to its safe value; none waits for the timeouts of another one.
-
-    See :func:`drive_to_safe` for the arguments; sequences have one item per device.
+    ``names`` are those of the axes; empty for the only one.
     """
-    outputs = list(zip(devices, goals, on_writes, strict=True))
-    if len(outputs) == 1:
-        device, goal, on_write = outputs[0]
-        return [drive_to_safe(device, goal, clock, sleep, on_write)]
-    with ThreadPoolExecutor(len(outputs)) as threads:
-        started = [
-            threads.submit(drive_to_safe, device, goal, clock, sleep, on_write)
-            for device, goal, on_write in outputs
-        ]
-        return [each.result() for each in started]
+    # First: a final state does not change any more.
+    final = all(each.final for each in reports)
+    worst = min((each.state for each in reports), key=_WORST.index)
+    whys = []
+    for report, name in zip(reports, names, strict=True):
+        text = report.error if report.state == worst else describe(report.state, report.error)
+        if report.state != "confirmed":
+            whys.append(": ".join(filter(None, (name, text))))
+    return OutputReport(worst, "; ".join(filter(None, whys)), final)
 
 
 def _is_local(error: BaseException | None) -> bool:

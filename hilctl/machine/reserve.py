@@ -1,4 +1,4 @@
-"""A reserve of a thread and descriptors, to write the safe value when no more are available."""
+"""A reserve of threads and descriptors, to write safe values when no more are available."""
 
 import os
 import sys
@@ -17,27 +17,30 @@ _DESCRIPTORS = 8
 
 
 class Reserve:
-    """The thread and descriptors that a process reserves; one per process, see :data:`RESERVE`."""
+    """The threads and descriptors that a process reserves; one per process, see :data:`RESERVE`."""
 
     def __init__(self) -> None:
-        self.thread: Thread | None = None
-        """The held thread."""
+        self.threads: list[Thread] = []
+        """The held threads."""
         self._descriptors: list[int] = []
         self._work: SimpleQueue[tuple[Callable[[], object], Event]] = SimpleQueue()
         self._idle = Semaphore(0)
 
-    def hold(self) -> None:
-        """Acquire the reserve, unless that was done; raise OSError or RuntimeError if it fails."""
-        if self.thread is not None:
-            return
-        self._descriptors = [os.open(os.devnull, os.O_RDONLY) for _ in range(_DESCRIPTORS)]
-        # A new thread would need memory. A daemon, so that a blocked one does not keep the process.
-        thread = Thread(target=self._serve, name="reserve", daemon=True)
-        thread.start()
-        self.thread = thread
+    def hold(self, lines: int = 1) -> None:
+        """Acquire what so many lines need, unless that was done.
+
+        Raise OSError or RuntimeError if it fails.
+        """
+        for _ in range(lines - len(self.threads)):
+            self._descriptors += [os.open(os.devnull, os.O_RDONLY) for _ in range(_DESCRIPTORS)]
+            # A new thread would need memory. A daemon, so that a blocked one does not keep the
+            # process.
+            thread = Thread(target=self._serve, name="reserve", daemon=True)
+            thread.start()
+            self.threads.append(thread)
 
     def run(self, work: Callable[[], object]) -> Event:
-        """Call ``work`` in the held thread; in a new one if that is busy, or not held.
+        """Call ``work`` in a held thread; in a new one if all are busy, or none is held.
 
         Return an event that is set afterwards. Raise RuntimeError if no thread can be started.
         """

@@ -131,7 +131,7 @@ class Job:
             segments=[each.to_mapping() for each in first.reference.segments]
             if run.config.trigger
             else [],
-            limits=first.silence,
+            limits=run.silence,
             supervisor=supervisor,
             silence_s=silence_s,
             safe_priority=safe_priority(run.config),

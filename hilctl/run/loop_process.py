@@ -30,9 +30,10 @@ from hilctl.loop.plan import LoopPlan
 from hilctl.loop.safe_output import (
     LoopOutcome,
     SafeGoal,
+    SafeOutput,
     describe,
-    drive_all_to_safe,
-    joint_state,
+    drive_to_safe,
+    joint_report,
 )
 from hilctl.loop.tuning import LinearBypass, Tuning
 from hilctl.machine.procfs import ProcessUsage
@@ -49,6 +50,7 @@ _LATE_TICKS, _STOP = int(PageField.LATE_TICKS), int(PageField.STOP)
 _SUPERVISOR_HEARTBEAT_NS = int(PageField.SUPERVISOR_HEARTBEAT_NS)
 _TUNE_WANTED, _TUNE_TAKEN = int(PageField.TUNE_WANTED), int(PageField.TUNE_TAKEN)
 _TUNE_BEGINS_AT = int(PageField.TUNE_BEGINS_AT)
+_UNANSWERED = int(PageField.UNANSWERED)
 _SILENCE_S = 1.0
 _POLL_S = 0.01
 
@@ -60,7 +62,17 @@ class RingLane:
         ring.prepare_blocks()
         self.claim, self.sending, self.answered = ring.claim, ring.sending, ring.answered
         self.record_event = ring.page.push_event
-        self.writing_safe = ring.page.note_safe_write
+        self.note_safe_write = ring.page.note_safe_write
+        self._numbers = ring.page.numbers
+
+    @property
+    def unanswered(self) -> bool:
+        """Whether the device may still execute a command that it has not answered."""
+        return bool(self._numbers[_UNANSWERED])
+
+    @unanswered.setter
+    def unanswered(self, unanswered: bool) -> None:
+        self._numbers[_UNANSWERED] = unanswered
 
 
 class RingHost:
@@ -253,22 +265,17 @@ def _make_safe(
     job: Job, devices: Sequence[Device], rings: Sequence[SampleRing], error: BaseException
 ) -> None:
     """Drive the outputs to their safe values after an error; raise RunError if not confirmed."""
-    goals = [
-        SafeGoal(
-            axis.safe_value,
-            axis.ramp_per_s,
-            ring.last_command(),
-            bool(ring.page.get(PageField.EXCHANGING)) and not device.info.simulated,
-        )
-        for axis, ring, device in zip(job.axes, rings, devices, strict=True)
-    ]
-    notes = [each.page.note_safe_write for each in rings]
-    found = drive_all_to_safe(devices, goals, time.monotonic, time.sleep, notes)
-    state, why = joint_state(found, [each.axis for each in job.axes])
-    if state != "confirmed":
+    began_s, outputs = time.monotonic(), []
+    for axis, ring, device in zip(job.axes, rings, devices, strict=True):
+        unanswered = bool(ring.page.get(PageField.UNANSWERED)) and not device.info.simulated
+        goal = SafeGoal(axis.safe_value, axis.ramp_per_s, ring.last_command(), unanswered)
+        outputs.append(SafeOutput(device, goal, began_s, note=ring.page.note_safe_write))
+    drive_to_safe(outputs)
+    report = joint_report([each.report for each in outputs], [each.axis for each in job.axes])
+    if report.state != "confirmed":
         # The cause first: an unreachable device is often its consequence.
         cause = str(error) if isinstance(error, HilctlError) else f"the loop broke: {error!r}"
-        raise RunError(f"{cause}; {describe(state, why)}") from error
+        raise RunError(f"{cause}; {describe(report.state, report.error)}") from error
 
 
 def _await(field: PageField, page: SharedPage, host: RingHost) -> None:

@@ -5,14 +5,22 @@ import os
 import signal
 import subprocess
 import time
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, suppress
 from typing import Any, Literal
 
 from hilctl import OWN_ENVIRONMENT
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.subprocesses import python_command
-from hilctl.run.run_folder import GUARDIAN, LOOP, DeviceLocks, RunFolder, locked_run, runs
+from hilctl.run.run_folder import (
+    GUARDIAN,
+    LOOP,
+    DeviceLocks,
+    OutputPlace,
+    RunFolder,
+    locked_run,
+    runs,
+)
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase, SharedPage
 
@@ -184,47 +192,64 @@ class GuardianProcess(ChildProcess):
 
 
 class GuardianRelief:
-    """Take a device over from guardians of earlier runs, which keep it until they are relieved.
+    """Take devices over from guardians of earlier runs, which keep them until they are relieved.
 
-    If this process and those that inherit its locks end before, the guardians act again.
+    If this process and those that inherit its locks end before, the guardians act again. A guardian
+    with another output than these keeps its devices: nothing else would make that one safe.
+
+    Args:
+        outputs: The outputs to be taken over.
     """
 
-    def __init__(self, holds: Sequence[str]) -> None:
-        self._pages: list[tuple[RunFolder, SharedPage]] = []
-        for run in runs() if holds else []:
-            if set(holds) & set(run.card.holds) and not run.supervised:
+    def __init__(self, outputs: Sequence[OutputPlace]) -> None:
+        self._runs: list[tuple[RunFolder, list[SharedPage]]] = []
+        for run in runs() if any(each.holds for each in outputs) else []:
+            real = [each for each in run.card.outputs if each.holds]
+            covered = all(any(each.is_same(one) for one in outputs) for each in real)
+            if real and covered and not run.supervised:
                 with suppress(OSError, ValueError):  # it has just ended
-                    if not (page := SampleRing(run.ring).page).is_settled():
-                        self._pages.append((run, page))
-        self.found = bool(self._pages)
-        """Whether there are earlier runs whose output is not safe."""
+                    numbers = range(len(run.card.outputs))
+                    pages = [SampleRing(run.ring_of(number)).page for number in numbers]
+                    if not pages[0].is_settled():
+                        self._runs.append((run, pages))
 
     @property
     def runs(self) -> list[RunFolder]:
         """The runs whose guardian is active."""
-        return [run for run, _ in self._pages if run.alive]
+        return [run for run, _ in self._runs if run.alive]
 
     def acquire(self, locks: DeviceLocks, check: Callable[[], object] = lambda: None) -> None:
-        """Acquire the locks of a device; raise InputError if its guardian does not release them.
+        """Acquire the locks of the devices; raise InputError if a guardian does not release them.
 
         ``check`` is called repeatedly, and may raise an error to give up.
         """
         deadline_s = time.monotonic() + _CLOSE_S
         while self.runs and locks.holder() and time.monotonic() < deadline_s:
             check()
-            for _, page in self._pages:
+            for _, (page, *_) in self._runs:
                 page.put(PageField.CLAIM, 1)
             time.sleep(_POLL_S)
         locks.acquire()
 
-    def note_write(self, value: float) -> None:
-        """Let the guardians continue a ramp from here if they act again."""
-        for _, page in self._pages:
-            page.note_safe_write(value)
+    def unanswered(self, output: OutputPlace) -> bool:
+        """Return whether an earlier run left a command to an output without an answer."""
+        return any(page.get(PageField.UNANSWERED) for page in self._pages(output))
+
+    def note_write(self, output: OutputPlace, value: float) -> None:
+        """Let the guardians continue the ramp of an output from here if they act again."""
+        for page in self._pages(output):
+            page.note_safe_write(value, bool(page.get(PageField.UNANSWERED)))
+
+    def _pages(self, output: OutputPlace) -> Iterator[SharedPage]:
+        """Yield the pages of the axes of earlier runs that had an output."""
+        for run, pages in self._runs:
+            for each, page in zip(run.card.outputs, pages, strict=True):
+                if each.is_same(output):
+                    yield page
 
     def relieve(self) -> None:
-        """Let the guardians end and remove their folders: another process protects the device."""
-        for run, page in self._pages:
+        """Let the guardians end and remove their folders: another process protects the devices."""
+        for run, (page, *_) in self._runs:
             page.put(PageField.RELIEVED, 1)
             if page.get(PageField.RECORDED):
                 with suppress(OSError):
@@ -232,7 +257,7 @@ class GuardianRelief:
 
     def restart(self) -> None:
         """Start the guardians again that have died; they act when the device is free."""
-        for run, page in self._pages:
+        for run, (page, *_) in self._runs:
             if not run.alive:
                 try:
                     with locked_run(run) as lock:

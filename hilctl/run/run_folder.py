@@ -26,7 +26,7 @@ from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import asdict, dataclass, field
 from functools import cache
 from pathlib import Path
-from typing import Any, Self
+from typing import Any, NamedTuple, Self
 
 from hilctl.base.errors import InputError, RunError
 from hilctl.base.private_dirs import (
@@ -58,6 +58,17 @@ _IF_STRANGER = "ask its user to stop it; hilctl run --take-over runs nevertheles
 _BACKLOG = 1000  # connections that query the holder of a device; never accepted
 
 
+class OutputPlace(NamedTuple):
+    """Place of an output, from its :class:`hilctl.base.device.DeviceInfo`."""
+
+    holds: tuple[str, ...]
+    output: str
+
+    def is_same(self, other: "OutputPlace") -> bool:
+        """Return whether two places are one output; a device may have several names."""
+        return self.output == other.output and bool({*self.holds} & {*other.holds})
+
+
 @dataclass(frozen=True, slots=True)
 class RunCard:
     """Identity of a run, for other commands."""
@@ -69,12 +80,14 @@ class RunCard:
     started: float  # unix time in s
     holds: tuple[str, ...] = ()  # resources of its devices, as DeviceInfo.holds
     axes: Mapping[str, str] = field(default_factory=dict)  # recordings; empty with one axis
+    outputs: tuple[OutputPlace, ...] = ()  # of each axis
 
     @classmethod
     def from_json(cls, text: str) -> Self:
         """Return a card; raise ValueError or TypeError if a text is not one."""
-        values = {"holds": [], **json.loads(text)}
-        return cls(**values | {"holds": tuple(values["holds"])})
+        values = {"holds": [], "outputs": [], **json.loads(text)}
+        outputs = tuple(OutputPlace(tuple(holds), name) for holds, name in values["outputs"])
+        return cls(**values | {"holds": tuple(values["holds"]), "outputs": outputs})
 
     @property
     def recordings(self) -> list[Path]:
@@ -273,11 +286,16 @@ def keep_removed() -> None:
 
 @contextmanager
 def run_folder(
-    experiment: str, recordings: Mapping[str, Path], started: float, holds: Sequence[str] = ()
+    experiment: str,
+    recordings: Mapping[str, Path],
+    started: float,
+    holds: Sequence[str] = (),
+    outputs: Sequence[OutputPlace] = (),
 ) -> Iterator[tuple[RunFolder, list[int]]]:
     """Provide a run's folder and descriptors of its locks; remove it at the end unless kept.
 
-    ``recordings`` are those of the axes by name; that of the only axis has an empty one.
+    ``recordings`` are those of the axes by name; that of the only axis has an empty one. See
+    :class:`RunCard` for ``holds`` and ``outputs``.
     """
     base, number = base_folder(), os.getpid()
     # Fails if the working folder was removed.
@@ -287,7 +305,8 @@ def run_folder(
     with ExitStack() as stack:
         try:
             path = _new_folder(base / f"{experiment}-{number}")
-            card = RunCard(path.name, experiment, recorded, number, started, tuple(holds), axes)
+            devices = tuple(holds), axes, tuple(outputs)
+            card = RunCard(path.name, experiment, recorded, number, started, *devices)
             folder = RunFolder(path, card)
             stack.callback(_clear_away, folder)
             unnamed = path / f"{_CARD}.new"
@@ -460,9 +479,10 @@ def _is_trusted(holder: tuple[int, int] | None) -> bool:
 def _in_use(name: str, holder: tuple[int, int] | None, hint: str = _IF_OWN) -> InputError:
     if guardian := _guardian_of(name):
         run, folder = guardian.card.name, guardian.path.parent
+        every = ", as hilctl safe does for all axes of its experiment" if guardian.card.axes else ""
         hint = (
-            f"the guardian of {run} sets its safe value. HILCTL_RUNS={folder} hilctl stop --run "
-            f"{run} ends it, and leaves the output as it is"
+            f"the guardian of {run} sets its safe value{every}. HILCTL_RUNS={folder} hilctl stop "
+            f"--run {run} ends it, and leaves the output as it is"
         )
     return InputError(f"{name} is in use by {_text_of(holder)}: {hint}")
 
@@ -558,7 +578,8 @@ def _is_locked(path: Path) -> bool:
 
 def facts_of(run: RunFolder) -> dict[str, Any]:
     """Return a run's card as plain values."""
-    return {key: value for key, value in asdict(run.card).items() if key != "axes" or value}
+    card = asdict(run.card)
+    return {key: card[key] for key in card if key != "outputs" and (key != "axes" or card[key])}
 
 
 def require_linux() -> None:

@@ -209,7 +209,7 @@ _FORWARDED = (signal.SIGINT, signal.SIGTERM, HANG_UP)
 def has_threads() -> bool:
     """Return whether this program has other threads, or the caller is not its main one."""
     main = threading.main_thread()
-    others = {*threading.enumerate()} - {main, RESERVE.thread}
+    others = {*threading.enumerate()} - {main, *RESERVE.threads}
     return bool(others) or threading.current_thread() is not main
 
 

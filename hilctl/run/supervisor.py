@@ -21,7 +21,7 @@ from types import FrameType
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
 from hilctl.base.formatting import encodable
-from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
+from hilctl.experiment.preflight import CheckedRun
 from hilctl.loop.pacer import deadline_misses
 from hilctl.loop.safe_output import LoopOutcome, describe
 from hilctl.machine.rt_setup import be_ordinary, favoured
@@ -32,7 +32,7 @@ from hilctl.run.metadata import RunDescription
 from hilctl.run.processes import GuardianProcess, GuardianRelief, LoopProcess
 from hilctl.run.recorder import Recorder, RingRecorder, discard_all, recorders_of, result_of
 from hilctl.run.result import Progress, RunResult, recordings_of
-from hilctl.run.run_folder import DeviceLocks, RunFolder, run_folder
+from hilctl.run.run_folder import DeviceLocks, OutputPlace, RunFolder, run_folder
 from hilctl.run.safety.safety_monitor import SafetyMonitor
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import PageField, PageSlot, SharedPage, Stop
@@ -129,20 +129,25 @@ class RunMonitor:
 
     def __init__(
         self,
-        checked: CheckedExperiment,
+        checked: CheckedRun,
         page: SharedPage,
         child: LoopProcess,
         safety: SafetyMonitor,
         recording: RingRecorder,
     ) -> None:
-        self._config, self._forecast = checked.loaded.config, checked.forecast
+        self._config, self._forecast = checked.config, checked.first.forecast
         self._page, self._child = page, child
         self._safety, self._recording = safety, recording
         self.outcome: LoopOutcome | None = None
         """Outcome of the run; None until the output is safe or nothing more can be done."""
         self.broke = ""
         """Error of the supervisor itself; may be empty."""
-        self._simulated = checked.loaded.device.info.simulated
+        self._simulated = checked.simulated
+        self._timeouts = ", ".join(
+            f"device.timeout_s{' of ' * bool(name)}{name} is "
+            f"{each.loaded.config.device.get('timeout_s', 'not set')}"
+            for name, each in zip(checked.names, checked.axes, strict=True)
+        )
         self._ended, self._silent_ns = False, 0  # from the last heartbeat of the loop to its end
 
     def poll(self, stop_signal: int) -> bool:
@@ -208,10 +213,9 @@ class RunMonitor:
         waited = self._page.get(PageField.EXCHANGING) and not self._simulated
         if not waited or self._silent_ns <= 1e9 * (limit_s + 2.0 * config.tick_s):
             return "the loop process hung, and was killed"
-        timeout = f"device.timeout_s is {config.device.get('timeout_s', 'not set')}"
         return (
-            f"an exchange took longer than timing.max_late_s ({limit_s:g} s; {timeout}), and the "
-            "loop process was killed in it: lower timeout_s, or raise max_late_s"
+            f"an exchange took longer than timing.max_late_s ({limit_s:g} s; {self._timeouts}), "
+            "and the loop process was killed in it: lower timeout_s, or raise max_late_s"
         )
 
     def _pass_stop_on(self, stop_signal: int) -> None:
@@ -277,7 +281,9 @@ class Supervisor:
             # second one must not discard the result of a run that has ended.
             stack.enter_context(self._signals())
             holds = self._checked.holds
-            relief = GuardianRelief(holds)
+            infos = [each.loaded.device.info for each in self._checked.axes]
+            outputs = [OutputPlace(each.holds, each.output) for each in infos]
+            relief = GuardianRelief(outputs)
             locks = stack.enter_context(DeviceLocks(holds, take_over=self._take_over))
             if not relief.runs:
                 # The device before the recording: a refused run must not touch a file.
@@ -285,7 +291,7 @@ class Supervisor:
             recorders = recorders_of(self._checked, self._recordings, overwrite=self._overwrite)
             try:
                 folder, own = stack.enter_context(
-                    run_folder(config.name, self._recordings, time.time(), holds)
+                    run_folder(config.name, self._recordings, time.time(), holds, outputs)
                 )
                 rings = self._make_rings(folder)
                 pages = [each.page for each in rings]
@@ -299,10 +305,10 @@ class Supervisor:
                     stack.enter_context(folder.description_of(axis).open("rb"))
                 inherits = locks.descriptors + own
                 child = LoopProcess(folder, page, inherits)
-                run = folder, rings[0], child, recording
+                run = folder, rings, child, recording
                 acquire = partial(relief.acquire, locks, self._raise_if_stopped)
                 safety, start_ns = self._start(stack, *run, inherits, acquire)
-                started = RunMonitor(self._checked.first, page, child, safety, recording)
+                started = RunMonitor(self._checked, page, child, safety, recording)
             except BaseException:
                 discard_all(recorders)
                 raise
@@ -333,19 +339,18 @@ class Supervisor:
         self,
         stack: ExitStack,
         folder: RunFolder,
-        ring: SampleRing,
+        rings: Sequence[SampleRing],
         child: LoopProcess,
         recording: RingRecorder,
         inherits: list[int],
         acquire: Callable[[], None],
     ) -> tuple[SafetyMonitor, int]:
         """Wait until loop and guardian are ready, and begin the recording."""
-        page, checked = ring.page, self._checked.first
-        safety = None
+        page, checked, safety = rings[0].page, self._checked, None
         try:
-            simulated = checked.loaded.device.info.simulated  # needs no guardian
-            guardian = None if simulated else partial(GuardianProcess, folder, page, inherits)
-            safety = SafetyMonitor(checked, ring, child, guardian, recording.record_event)
+            guardian = partial(GuardianProcess, folder, page, inherits)
+            needed = None if checked.simulated else guardian
+            safety = SafetyMonitor(checked, rings, child, needed, recording.record_event)
             child.await_ready(lambda: self._stop_signal != 0, acquire)
             # Started after the loop, because it watches the loop's process.
             self._await_guardian(safety)
@@ -383,7 +388,7 @@ class Supervisor:
         """
         set_up, learned, refused = json.loads(page.read_text(PageSlot.SET_UP))
         infos = [each.loaded.device.info for each in self._checked.axes]
-        for line in [] if infos[0].simulated else refused:
+        for line in [] if self._checked.simulated else refused:
             _warn_refused(line)
         # The watchdogs are armed between the start signal and sample 0.
         least_ns = _START_DELAY_NS + round(sum(each.arm_s for each in infos) * 1e9)

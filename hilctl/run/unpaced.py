@@ -67,7 +67,7 @@ class OfflineLane:
         heads = [head.data.cast("B").cast("q") for head in self._room.heads]
         self._blocks = [Block(head, self._room, slot) for slot, head in enumerate(heads)]
         self.claimed = self._first = self._answered = 0
-        self.exchanging = False
+        self.exchanging = self.unanswered = False
         self._on_batch, self._on_event = on_batch, on_event
 
     def claim(self, *, due: bool = True) -> Block:
@@ -100,7 +100,7 @@ class OfflineLane:
             self._room.clear_answers(taken)
             self._first = self._answered
 
-    def writing_safe(self, value: float) -> None:
+    def note_safe_write(self, value: float, unanswered: bool) -> None:
         """Do nothing: no other process continues the ramp."""
 
     def record_event(self, event: Event) -> None:

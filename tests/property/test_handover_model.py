@@ -31,7 +31,7 @@ CODE = {
     "supervisor.close": "hilctl.run.safety.safety_monitor:SafetyMonitor.close",
     "command.claim": "hilctl.run.processes:GuardianRelief.acquire",
     "command.acquire": "hilctl.run.run_folder:DeviceLocks.holder",
-    "command.attempt": "hilctl.run.safety.manual_safe:_drive",
+    "command.attempt": "hilctl.loop.safe_output:drive_to_safe",
     "command.restart": "hilctl.run.processes:GuardianRelief.restart",
     "command.go": "hilctl.run.supervisor:_go",
     "command.relieve": "hilctl.run.processes:GuardianRelief.relieve",

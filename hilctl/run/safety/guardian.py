@@ -1,15 +1,15 @@
-"""The guardian: a small process that sets the output to its safe value if the loop cannot.
+"""The guardian: a small process that sets the outputs to their safe values if the loop cannot.
 
 Started by the supervisor as ``python -m hilctl.run.safety.guardian JOB PIDFD PID``, with a pidfd
 and the number of the loop process. Once it watches, it reads no file, imports nothing and waits for
 no other process, so neither a disk nor the supervisor can delay the safe value.
 
-It acts if the loop hangs or dies without a confirmed safe output. It retries until the device
-confirms the safe value, even after the supervisor has ended; then SIGTERM ends it. The supervisor
-drives the device only after the guardian has ended, so two processes never hold it.
+It acts if the loop hangs or dies without confirmed safe outputs. It retries until each device
+confirms its safe value, even after the supervisor has ended; then SIGTERM ends it. The supervisor
+drives the devices only after the guardian has ended, so two processes never hold them.
 
-Another command can claim the device. The guardian then closes it, releases its locks and waits for
-them: it acts again when they are free, unless that command has relieved it.
+Another command can claim the devices. The guardian then closes them, releases their locks and waits
+for them: it acts again when they are free, unless that command has relieved it.
 
 As ``python -m hilctl.run.safety.guardian JOB act`` it acts without a loop to watch, as soon as the
 supervisor does not; as ``JOB wait`` it first waits for the locks of the device.
@@ -22,8 +22,9 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
+from dataclasses import dataclass
 from functools import partial
 from pathlib import Path
 from types import FrameType
@@ -37,6 +38,9 @@ from hilctl.loop.safe_output import (
     LocalError,
     SafeGoal,
     SafeOutput,
+    drive_in_turn,
+    joint_report,
+    lines_of,
 )
 from hilctl.machine.reserve import RESERVE
 from hilctl.machine.rt_setup import be_ordinary, be_quick
@@ -119,110 +123,153 @@ def is_stopped(process: int) -> bool:
     return stat.rpartition(b")")[2].split()[0] in {b"T", b"t"}
 
 
-class SafeAction:
-    """Drive a device to its safe value in a thread until the result is final.
+@dataclass(frozen=True, slots=True)
+class GuardedAxis:
+    """One axis of a run, whose output another process sets to its safe value after the loop.
 
-    Args:
+    Attributes:
+        name: Name of the axis; empty if it is the only one.
         device: Not open; each write opens a connection.
-        goal: The safe value and the ramp to it.
-        prepare: Called first in that thread.
+        safe_value: In the device's command unit.
+        ramp_per_s: Slew rate of the ramp to it, > 0.
+    """
+
+    name: str
+    device: Device
+    ring: SampleRing
+    safe_value: float
+    ramp_per_s: float
+
+    def output(self, began_s: float) -> SafeOutput:
+        """Return the ramp that begins where the loop, or another process, left the output."""
+        page, start, unanswered = self.ring.page, None, False
+        if not self.device.info.simulated:  # each process has its own simulation
+            # Loop, guardian or supervisor may have started the ramp.
+            start = page.last_safe_write()
+            if start is None:
+                start = self.ring.last_command()
+            unanswered = bool(page.get(PageField.UNANSWERED))
+        goal = SafeGoal(self.safe_value, self.ramp_per_s, start, unanswered)
+        return SafeOutput(self.device, goal, began_s, note=page.note_safe_write)
+
+
+class _Line:
+    """The outputs of one line, and the thread that drives them until all are final.
 
     Attributes:
         failed: Error of this process, so that another one must try; may be empty.
     """
 
     def __init__(
-        self,
-        page: SharedPage,
-        device: Device,
-        goal: SafeGoal,
-        *,
-        hung: bool,
-        prepare: Callable[[], object] = lambda: None,
+        self, axes: Sequence[GuardedAxis], began_s: float, prepare: Callable[[], object]
     ) -> None:
-        self._device, self._page = device, page
-        self._output = SafeOutput(device, goal, on_write=partial(_note_write, page, goal.value))
-        self._hung, self._prepare = hung, prepare
-        self._result = SafeActionResult(hung, "unknown", self._output.error, final=False)
-        self._ending = threading.Event()
+        self.axes = axes
+        self.outputs = [each.output(began_s) for each in axes]
+        self._prepare = prepare
+        self.ending, self.ended = threading.Event(), threading.Event()
         self.failed = ""
-        self._ended = RESERVE.run(self._run)
+        try:
+            self.ended = RESERVE.run(self._run)
+        except RuntimeError as error:
+            self.failed = str(error)
+            self.ended.set()
 
     def _run(self) -> None:
-        output = self._output
         try:
             self._prepare()
-            while not output.final and not self._ending.is_set():
-                self._attempt()
-                self._result = SafeActionResult(
-                    self._hung, output.state, output.error, output.final
-                )
-                if output.pause_s >= PATIENT_PAUSE_S:
-                    be_ordinary()
-                if not output.final:
-                    self._ending.wait(output.pause_s)
+            drive_in_turn(self.outputs, self.ending.is_set, self._wait, RESERVE.release)
         except LocalError as error:
             self.failed = str(error)
         except Exception as error:  # noqa: BLE001  every error leaves the output unconfirmed
             self.failed = f"{type(error).__name__}: {error}"
 
-    def _attempt(self) -> None:
-        try:
-            self._output.attempt()
-        except LocalError:
-            if not RESERVE.release():
-                raise
-        finally:
-            self._page.put(PageField.UNANSWERED, int(self._output.pending))
+    def _wait(self, wait_s: float) -> bool:
+        if all(each.pause_s >= PATIENT_PAUSE_S for each in self.outputs):
+            be_ordinary()
+        return self.ending.wait(wait_s)
+
+
+class SafeAction:
+    """Drive outputs to their safe values until all are final; all ramps begin now.
+
+    Each line has a thread of its own, see :func:`hilctl.loop.safe_output.lines_of`.
+
+    Args:
+        prepare: Called first in each thread.
+    """
+
+    def __init__(
+        self,
+        axes: Sequence[GuardedAxis],
+        *,
+        hung: bool,
+        prepare: Callable[[], object] = lambda: None,
+    ) -> None:
+        self._hung, self._prepare = hung, prepare
+        began_s = time.monotonic()
+        self._lines = [_Line(line, began_s, prepare) for line in lines_of(axes)]
 
     def result(self, wait_s: float = 0.0) -> SafeActionResult:
         """Return the result so far, after ``wait_s`` or as soon as it is final."""
-        self._ended.wait(wait_s)
-        return self._result
+        self._await(wait_s)
+        outputs = [each for line in self._lines for each in line.outputs]
+        names = [each.name for line in self._lines for each in line.axes]
+        report = joint_report([each.report for each in outputs], names)
+        return SafeActionResult(self._hung, *report)
+
+    @property
+    def failed(self) -> str:
+        """Errors of this process, so that another one must try; may be empty."""
+        return "; ".join(dict.fromkeys(each.failed for each in self._lines if each.failed))
+
+    def retry_failed(self) -> None:
+        """Drive the outputs again that this process failed to drive."""
+        for k, line in enumerate(self._lines):
+            if line.failed:
+                self._lines[k] = _Line(line.axes, time.monotonic(), self._prepare)
 
     @property
     def is_over(self) -> bool:
-        """Whether nothing more is written: the result is final, it failed or was ended."""
-        return self._ended.is_set()
+        """Whether nothing more is written: all is final, failed or ended."""
+        return self._await(0.0)
 
     def end(self, wait_s: float) -> bool:
-        """Stop writing; return whether the last write ends within ``wait_s``."""
-        self._ending.set()
-        return self._ended.wait(wait_s)
+        """Stop writing; return whether the last writes end within ``wait_s``."""
+        for line in self._lines:
+            line.ending.set()
+        return self._await(wait_s)
 
-    def release_device(self, beat: Callable[[], object] = lambda: None) -> None:
-        """Stop writing, which may take the device's timeout, and close the device."""
+    def release_devices(self, beat: Callable[[], object] = lambda: None) -> None:
+        """Stop writing, which may take the devices' timeouts, and close the devices."""
         while not self.end(_WAIT_S):
             beat()
-        with suppress(Exception):  # the next process opens it anew
-            self._device.close()
+        for axis in (axis for line in self._lines for axis in line.axes):
+            with suppress(Exception):  # the next process opens it anew
+                axis.device.close()
 
-
-def _note_write(page: SharedPage, safe_value: float, value: float) -> None:
-    """Leave to the next process where the ramp is, and that a command is without an answer."""
-    page.note_safe_write(value)
-    if value != safe_value:
-        page.put(PageField.UNANSWERED, 1)
+    def _await(self, wait_s: float) -> bool:
+        until_s = time.monotonic() + wait_s
+        return all(line.ended.wait(max(0.0, until_s - time.monotonic())) for line in self._lines)
 
 
 class Guardian:
     """Watch the loop, and set the output to its safe value if the loop died or hangs.
 
     Args:
+        page: Page of the run.
         has_locks: Whether this process inherited the locks of the device.
     """
 
     def __init__(
         self,
-        ring: SampleRing,
-        device: Device,
+        axes: Sequence[GuardedAxis],
+        page: SharedPage,
         job: Job,
         prepare: Callable[[], object] = lambda: None,
         *,
         has_locks: bool = True,
     ) -> None:
-        self._ring, self._page = ring, ring.page
-        self._device, self._job = device, job
+        self._axes, self._page, self._job = axes, page, job
         self._prepare = prepare
         self._locks = DeviceLocks(
             job.holds, take_over=job.take_over, inherited=job.locks if has_locks else ()
@@ -259,13 +306,11 @@ class Guardian:
         signal.signal(signal.SIGTERM, self._end)
         while self._awaits_device():
             page.put(PageField.GUARDIAN_PHASE, GuardianPhase.ACTING)
-            axis = self._job.axes[0]
-            goal = safe_goal(self._ring, self._device, axis.safe_value, axis.ramp_per_s)
-            action = SafeAction(page, self._device, goal, hung=hung, prepare=self._prepare)
+            action = SafeAction(self._axes, hung=hung, prepare=self._prepare)
             if self._is_final(action):
                 action.end(0.0)
                 break
-            action.release_device(self._beat)
+            action.release_devices(self._beat)
             if page.get(PageField.CLAIM):
                 self._release_locks()
         page.put(PageField.GUARDIAN_PHASE, GuardianPhase.DONE)
@@ -320,43 +365,31 @@ class Guardian:
         return False
 
 
-def safe_goal(ring: SampleRing, device: Device, value: float, ramp_per_s: float) -> SafeGoal:
-    """Return the goal after a loop that died, from its data in the ring."""
-    page, info = ring.page, device.info
-    # Loop, guardian or supervisor may have started the ramp.
-    start = page.last_safe_write()
-    if start is None:
-        start = ring.last_command()
-    # A loop that ended without a confirmed output lost its device in an exchange.
-    lost = page.get(PageField.EXCHANGING) or page.get(PageField.PHASE) == Phase.ENDED
-    if info.simulated:  # each process has its own simulation
-        return SafeGoal(value, ramp_per_s, None, pending=False)
-    return SafeGoal(value, ramp_per_s, start, bool(lost or page.get(PageField.UNANSWERED)))
-
-
 def main(words: list[str]) -> int:
     """Guard one run; the exit code is 0 if the job could be read."""
     for number in (signal.SIGINT, signal.SIGTERM, signal.SIGHUP):
         signal.signal(number, signal.SIG_IGN)  # it ends after the loop
     job = Job.read(Path(words[0]))
-    axis = job.axes[0]  # a run of several axes is simulated, and has no guardian
-    ring = SampleRing(Path(axis.ring))
-    page = ring.page
+    rings = [SampleRing(Path(each.ring)) for each in job.axes]
+    page = rings[0].page
     page.put(PageField.GUARDIAN_PID, os.getpid())
     try:
-        device = axis.device()
+        axes = [
+            GuardedAxis(each.axis, each.device(), ring, each.safe_value, each.ramp_per_s)
+            for each, ring in zip(job.axes, rings, strict=True)
+        ]
     except (HilctlError, MemoryError) as error:
         page.write_text(PageSlot.GUARDIAN, str(error) or "not enough memory")
         # After the text, which readers expect in this phase.
         page.put(PageField.GUARDIAN_PHASE, GuardianPhase.FAILED)
         return 1
-    RESERVE.hold()
+    RESERVE.hold(len(axes))
     "localhost".encode("idna")  # import the codec now, not at the first connection
     process = LinuxProcess()
     _stay_in_memory(process)
     be_quick(job.safe_priority, process)
     prepare = partial(be_quick, job.safe_priority, process)
-    guardian = Guardian(ring, device, job, prepare, has_locks=words[1] != "wait")
+    guardian = Guardian(axes, page, job, prepare, has_locks=words[1] != "wait")
     if words[1] in {"act", "wait"}:
         guardian.act(hung=False)
     else:

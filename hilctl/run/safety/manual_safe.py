@@ -1,4 +1,4 @@
-"""``hilctl safe``: set a device to its safe value without a run."""
+"""``hilctl safe``: set devices to their safe values without a run."""
 
 import logging
 import time
@@ -8,29 +8,23 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.axes import one_axis_document, with_settings
+from hilctl.base.axes import of_each_axis, with_settings
 from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, RunError
 from hilctl.base.files import TextFiles
-from hilctl.base.yaml import load_document
+from hilctl.base.yaml import Document, load_document
 from hilctl.experiment.devices import made_device
 from hilctl.experiment.sections.safe import Safe
-from hilctl.loop.safe_output import (
-    PATIENCE_S,
-    LocalError,
-    OutputState,
-    SafeGoal,
-    SafeOutput,
-)
+from hilctl.loop.safe_output import OutputState, SafeGoal, SafeOutput, drive_to_safe
 from hilctl.run.processes import GuardianRelief
-from hilctl.run.run_folder import DeviceLocks
+from hilctl.run.run_folder import DeviceLocks, OutputPlace
 
 _log = logging.getLogger(__name__)
 
 
 @dataclass(frozen=True, slots=True)
 class SafeResult:
-    """Result of setting the safe value."""
+    """Result of setting the safe value of one axis."""
 
     device: str
     value: float
@@ -57,58 +51,84 @@ def put_safe(
     settings: Sequence[str],
     clock: Callable[[], float] = time.monotonic,
     sleep: Callable[[float], None] = time.sleep,
-) -> SafeResult:
-    """Set the device of an experiment to the experiment's safe value, without a ramp.
+) -> dict[str, SafeResult]:
+    """Set the devices of an experiment to its safe values, without a ramp; Ctrl-C ends it.
 
-    Only these sections of the file are validated. A guardian of an earlier run leaves the device
-    to this command, and acts again if the device does not confirm.
+    Only these sections of the file are validated. A guardian of an earlier run leaves the devices
+    to this command, and acts again if a device does not confirm.
+
+    Returns:
+        The result of each axis by name; that of an experiment without axes under "".
 
     Raises:
-        InputError: The file is not valid, or a run holds the device; nothing was sent.
+        InputError: The file is not valid, or a run holds a device; nothing was sent.
     """
-    document = one_axis_document(with_settings(load_document(path), settings))
-    given = "safe" in document.data
-    safe = document.validate(Safe, at=("safe",)) if given else Safe()
+    document = with_settings(load_document(path), settings)
+    axes = of_each_axis(document, lambda _, part: _device_and_value(path, part))
+    outputs = list[SafeOutput]()
+    infos = [device.info for device, _ in axes.values()]
+    places = [OutputPlace(info.holds, info.output) for info in infos]
+    holds = list(dict.fromkeys(name for info in infos for name in info.holds))
+    with ExitStack() as stack:
+        # Refused while a run holds a device: its loop would overwrite the safe value.
+        relief = _taken_over(stack, holds, places)
+        began_s = clock()
+        for (device, value), place in zip(axes.values(), places, strict=True):
+            # Without a lock another process may have sent commands.
+            unanswered = relief is None or relief.unanswered(place)
+            goal, note = SafeGoal(value, 1.0, None, unanswered), _note(relief, place)
+            outputs.append(SafeOutput(device, goal, began_s, clock, note))
+            stack.callback(_close, device)
+        with suppress(KeyboardInterrupt):
+            drive_to_safe(outputs, sleep)
+        guarded = False
+        if relief is not None:
+            if all(each.report.final for each in outputs):
+                relief.relieve()
+            else:
+                relief.restart()
+                guarded = bool(relief.runs)
+    return {
+        name: SafeResult(
+            device=info.description,
+            value=value,
+            unit=info.command_unit,
+            output=output.report.state,
+            error=output.report.error,
+            guardian_active=guarded,
+        )
+        for (name, (_, value)), info, output in zip(axes.items(), infos, outputs, strict=True)
+    }
+
+
+def _device_and_value(path: Path, document: Document) -> tuple[Device, float]:
+    """Return the device of an axis, not open, and its safe value."""
+    safe = document.validate(Safe, at=("safe",)) if "safe" in document.data else Safe()
     device = made_device(document, path.parent, TextFiles())
     if device is None:
         raise ConfigError([ConfigProblem(str(path), "device", "is required, with a key kind")])
-    info = device.info
-    with ExitStack() as stack:
-        # Refused while a run holds the device: its loop would overwrite the safe value.
-        died, relief = _taken_over(stack, info.holds)
-        goal = SafeGoal(safe.value, 1.0, None, pending=died)
-        output = SafeOutput(device, goal, clock, relief.note_write)
-        stack.callback(_close, device)
-        _drive(output, clock, sleep)
-        if output.final:
-            relief.relieve()
-        else:
-            relief.restart()
-    return SafeResult(
-        device=info.description,
-        value=safe.value,
-        unit=info.command_unit,
-        output=output.state,
-        error=output.error,
-        guardian_active=bool(relief.runs) and not output.final,
-    )
+    return device, safe.value
 
 
-def _taken_over(stack: ExitStack, holds: Sequence[str]) -> tuple[bool, GuardianRelief]:
-    """Take a device over until the end of a stack, without locks if they cannot be created.
+def _note(relief: GuardianRelief | None, output: OutputPlace) -> Callable[[float, bool], None]:
+    return lambda value, unanswered: relief.note_write(output, value) if relief else None
 
-    Return whether a run of it died, which may have left an unanswered command, and the relief of
-    its guardian.
+
+def _taken_over(
+    stack: ExitStack, holds: Sequence[str], outputs: Sequence[OutputPlace]
+) -> GuardianRelief | None:
+    """Take devices over until the end of a stack; return the relief of their guardians.
+
+    None if the locks cannot be created, such as in a full /dev/shm.
     """
-    died, relief = True, GuardianRelief(())
     try:
-        relief = GuardianRelief(holds)
-        died = relief.found
+        relief = GuardianRelief(outputs)
         # Another user must not prevent the safe value.
         relief.acquire(stack.enter_context(DeviceLocks(holds, take_over=True)))
-    except RunError as error:  # such as a full /dev/shm: the output must become safe nevertheless
+    except RunError as error:  # the outputs must become safe nevertheless
         _log.warning("%s: the safe value is written anyway", error)
-    return died, relief
+        return None
+    return relief
 
 
 def _close(device: Device) -> None:
@@ -117,17 +137,3 @@ def _close(device: Device) -> None:
         device.close()
     except HilctlError as error:
         _log.warning("%s", error)
-
-
-def _drive(output: SafeOutput, clock: Callable[[], float], sleep: Callable[[float], None]) -> None:
-    """Write until the state is final or set, a time limit, or Ctrl-C."""
-    give_up_s = clock() + PATIENCE_S
-    with suppress(KeyboardInterrupt):
-        while True:
-            try:
-                output.attempt()
-            except LocalError as error:
-                output.error = str(error)
-            if output.final or output.state == "set" or clock() >= give_up_s:
-                return
-            sleep(output.pause_s)

@@ -1,27 +1,33 @@
 """The supervisor's monitor of loop and guardian, which replaces a lost guardian.
 
 The guardian acts by itself if the loop dies or hangs. The supervisor restarts a lost guardian, and
-sets the safe value itself if no guardian can: for a simulated device, or if the guardian died,
-hangs, or cannot drive the device. It kills the guardian first, so that only one process holds the
-device. Another guardian then waits: it acts if the supervisor dies, and an output that is not
-confirmed at the end of the run is left to it.
+sets the safe values itself if no guardian can: for simulated devices, or if the guardian died,
+hangs, or cannot drive the devices. It kills the guardian first, so that only one process holds the
+devices. Another guardian then waits: it acts if the supervisor dies, and outputs that are not
+confirmed at the end of the run are left to it.
 """
 
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from contextlib import suppress
 from functools import partial
 from typing import Literal, TypeAlias
 
 from hilctl.base.errors import RunError
 from hilctl.base.events import Event
-from hilctl.experiment.preflight import CheckedExperiment
+from hilctl.experiment.preflight import CheckedRun
 from hilctl.loop.safe_output import PATIENCE_S
 from hilctl.machine.reserve import RESERVE
 from hilctl.machine.rt_setup import be_ordinary, be_quick
 from hilctl.run.job import safe_priority
 from hilctl.run.processes import GuardianProcess, LoopProcess
-from hilctl.run.safety.guardian import LAST_CALL_MS, HangWatch, SafeAction, is_stopped, safe_goal
+from hilctl.run.safety.guardian import (
+    LAST_CALL_MS,
+    GuardedAxis,
+    HangWatch,
+    SafeAction,
+    is_stopped,
+)
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, SafeActionResult
 
@@ -39,29 +45,34 @@ StartGuardian: TypeAlias = Callable[[int | Literal["act"]], GuardianProcess]
 
 
 class SafetyMonitor:
-    """Ensure a safe output after a loop that died or hangs.
+    """Ensure safe outputs after a loop that died or hangs.
 
     Args:
+        rings: Ring of each axis; the page of the first one is that of the run.
         start_guardian: Starts a guardian that watches a process or, with "act", acts if the
             supervisor does not; None if the run needs no guardian.
     """
 
     def __init__(
         self,
-        checked: CheckedExperiment,
-        ring: SampleRing,
+        checked: CheckedRun,
+        rings: Sequence[SampleRing],
         child: LoopProcess,
         start_guardian: StartGuardian | None,
         record_event: Callable[[Event], None],
     ) -> None:
-        self._ring, self._page, self._child = ring, ring.page, child
-        self._device = checked.loaded.device
-        self._limits = limits = checked.loaded.config.command_limits()
-        way = max(limits.high - limits.safe, limits.safe - limits.low)
-        self._patience_ns = round(1e9 * (PATIENCE_S + way / limits.ramp_per_s))
-        self._priority = safe_priority(checked.loaded.config)
-        self._watch = HangWatch(ring.page, checked.silence, lambda: is_stopped(child.pid))
-        RESERVE.hold()
+        self._page, self._child = rings[0].page, child
+        self._axes, longest_s = list[GuardedAxis](), 0.0
+        for each, ring in zip(checked.axes, rings, strict=True):
+            loaded, limits = each.loaded, each.loaded.config.command_limits()
+            axis = loaded.axis, loaded.device, ring, limits.safe, limits.ramp_per_s
+            self._axes.append(GuardedAxis(*axis))
+            way = max(limits.high - limits.safe, limits.safe - limits.low)
+            longest_s = max(longest_s, way / limits.ramp_per_s)
+        self._patience_ns = round(1e9 * (PATIENCE_S + longest_s))
+        self._priority = safe_priority(checked.config)
+        self._watch = HangWatch(self._page, checked.silence, lambda: is_stopped(child.pid))
+        RESERVE.hold(len(rings))
         self._start_guardian, self._record_event = start_guardian, record_event
         self._guardian = start_guardian(child.pid) if start_guardian else None
         self._started_ns: int | None = None
@@ -112,8 +123,7 @@ class SafetyMonitor:
             self._acted_ns = now_ns
             be_quick(self._priority)
             try:
-                with suppress(RuntimeError):  # no thread can be started: retried at the next poll
-                    self._stand_in()
+                self._stand_in()
             finally:
                 be_ordinary()
         by, result = self._reached()
@@ -133,7 +143,7 @@ class SafetyMonitor:
         return "guardian", self._page.safe_result()
 
     def _stand_in(self) -> None:
-        """Drive the device here, and have a guardian wait."""
+        """Drive the devices here, and have a guardian wait."""
         page, guardian = self._page, self._guardian
         page.put(PageField.STANDS_IN, 1)
         # Both before the device is used: neither may write to it afterwards.
@@ -145,10 +155,11 @@ class SafetyMonitor:
         result = page.safe_result()
         if result is not None and result.final:
             return
-        limits = self._limits
-        goal = safe_goal(self._ring, self._device, limits.safe, limits.ramp_per_s)
-        prepare = partial(be_quick, self._priority)
-        self._action = SafeAction(page, self._device, goal, hung=self._hung, prepare=prepare)
+        if self._action is None:
+            prepare = partial(be_quick, self._priority)
+            self._action = SafeAction(self._axes, hung=self._hung, prepare=prepare)
+        else:
+            self._action.retry_failed()
         if self._start_guardian is not None and (guardian is None or guardian.ended):
             with suppress(OSError, MemoryError):  # it is tried again
                 self._guardian = self._start_guardian("act")
@@ -223,9 +234,7 @@ class SafetyMonitor:
                     return True
             if action.is_over or guardian is None or guardian.ended:
                 time.sleep(_REPEAT_NS * 1e-9)
-                with suppress(RuntimeError):  # no thread can be started: retried
-                    self._stand_in()
-                action = self._action or action
+                self._stand_in()
             self.result = action.result(_POLL_S)
             if self.result.final:
                 self._page.put(PageField.RELIEVED, 1)
@@ -235,5 +244,5 @@ class SafetyMonitor:
 
     def _release(self, action: SafeAction) -> None:
         """Stop writing, and leave the device to the guardian that waits for it."""
-        action.release_device()
+        action.release_devices()
         self._page.put(PageField.STANDS_IN, 0)

@@ -186,6 +186,8 @@ _LATENESS = (
 )
 """The fields of :class:`~hilctl.loop.pacer.Lateness`, in its order."""
 
+_UNANSWERED = int(PageField.UNANSWERED)
+
 _USAGE = tuple(PageField[field.name.upper()] for field in fields(ProcessUsage))
 
 
@@ -291,8 +293,12 @@ class SharedPage:
             return LoopOutcome(**json.loads(self.read_text(PageSlot.OUTCOME)))
         return None
 
-    def note_safe_write(self, value: float) -> None:
-        """Note a write of the safe ramp, so that another process can continue it."""
+    def note_safe_write(self, value: float, unanswered: bool) -> None:
+        """Note a write of the safe ramp, so that another process can continue it.
+
+        ``unanswered``: whether a command may still be executed later.
+        """
+        self.numbers[_UNANSWERED] = unanswered
         # One number, because the guardian cannot publish; a written 0 is -0.0, none is 0.0.
         self.put_float(PageField.LAST_SAFE_WRITE, value or -0.0)
 

@@ -86,7 +86,7 @@ def test_check_lists_the_triggers(json_of, hilctl):
 
 @pytest.mark.parametrize("as_json", [True, False])
 def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, hilctl, as_json):
-    put = SafeResult("a device", 0.0, "A", "unknown", "no answer")
+    put = {"": SafeResult("a device", 0.0, "A", "unknown", "no answer")}
     monkeypatch.setattr(module, "put_safe", lambda path, settings: put)
     code, out, err = hilctl("safe", DEMO, *["--json"] * as_json)
     assert code == 3

@@ -1,6 +1,7 @@
 """The ramp of an output to the safe value, until the device confirms it."""
 
 import errno
+import threading
 from types import SimpleNamespace
 
 import pytest
@@ -9,10 +10,14 @@ from hilctl.base.errors import DeviceError, UnconfirmedError
 from hilctl.loop.safe_output import (
     PATIENCE_S,
     LocalError,
+    OutputReport,
     SafeGoal,
     SafeOutput,
     describe,
+    drive_in_turn,
     drive_to_safe,
+    joint_report,
+    lines_of,
 )
 from tests.fakes import FakeInfo
 
@@ -46,11 +51,9 @@ class Amplifier:
 def driven(amplifier, until_s=1e3, *, start=4.0, pending=False, ramp_per_s=20.0):
     """Attempt until it is final, as a guardian does."""
     goal = SafeGoal(0.0, ramp_per_s, start, pending)
-    output = SafeOutput(amplifier, goal, amplifier.clock)
-    while not output.final and amplifier.now_s < until_s:
-        output.attempt()
-        amplifier.sleep(output.pause_s)
-    return output
+    output = SafeOutput(amplifier, goal, amplifier.clock(), amplifier.clock)
+    drive_in_turn([output], lambda: amplifier.now_s >= until_s, amplifier.sleep, lambda: False)
+    return output.report
 
 
 @pytest.mark.parametrize("start", [4.0, -4.0])
@@ -136,33 +139,113 @@ def test_exhausted_process_is_no_device_error(number):
 
 def test_driving_ends_when_waiting_gains_nothing():
     amplifier = Amplifier()
-    output = drive_to_safe(
-        amplifier, SafeGoal(0.0, 20.0, 4.0, pending=True), amplifier.clock, amplifier.sleep
-    )
-    assert output.state == "set"
+    goal = SafeGoal(0.0, 20.0, 4.0, pending=True)
+    output = SafeOutput(amplifier, goal, amplifier.clock(), amplifier.clock)
+    drive_to_safe([output], amplifier.sleep)
+    assert output.report.state == "set"
     assert amplifier.now_s == pytest.approx(100.2, abs=0.02)
 
 
 def test_driving_ends_after_its_time_limit():
     amplifier = Amplifier()
     amplifier.down_until_s = 1e9
-    output = drive_to_safe(
-        amplifier, SafeGoal(0.0, 20.0, 4.0, pending=True), amplifier.clock, amplifier.sleep
-    )
-    assert (output.state, output.error) == ("unknown", "no answer")
+    goal = SafeGoal(0.0, 20.0, 4.0, pending=True)
+    output = SafeOutput(amplifier, goal, amplifier.clock(), amplifier.clock)
+    drive_to_safe([output], amplifier.sleep)
+    assert (output.report.state, output.report.error) == ("unknown", "no answer")
     assert amplifier.now_s == pytest.approx(100.2 + PATIENCE_S, abs=0.6)
 
 
 def test_each_write_is_noted_before_it_is_sent():
     amplifier, noted = Amplifier(), []
-    amplifier.error = DeviceError("no answer")
+    goal = SafeGoal(0.0, 20.0, 4.0, pending=False)
     output = SafeOutput(
-        amplifier, SafeGoal(0.0, 20.0, 4.0, pending=False), amplifier.clock, noted.append
+        amplifier, goal, amplifier.clock(), amplifier.clock, lambda *note: noted.append(note)
     )
+    amplifier.make_safe = lambda value: noted.append("sent")
     output.attempt()
-    assert noted == [pytest.approx(3.9)]
+    value = pytest.approx(3.9)
+    assert noted == [(value, True), "sent", (value, False)]
 
 
 def test_only_a_confirmed_output_is_called_confirmed():
     assert [state for state in ("confirmed", "set", "sent", "unknown")
             if "confirmed by" in describe(state)] == ["confirmed"]  # fmt: skip
+
+
+NAMES = ["x", "y"]
+
+
+def outputs_of(*amplifiers, start=4.0):
+    """Return the outputs of several devices, on ramps from one start time."""
+    goal = SafeGoal(0.0, 20.0, start, pending=False)
+    return [SafeOutput(each, goal, amplifiers[0].clock(), each.clock) for each in amplifiers]
+
+
+def test_outputs_of_one_line_ramp_in_turn():
+    x, y = Amplifier(takes_s=0.001), Amplifier(takes_s=0.002)
+    y.clock, y.sleep = x.clock, x.sleep
+    outputs = outputs_of(x, y)
+    drive_in_turn(outputs, lambda: False, x.sleep)
+    assert joint_report([each.report for each in outputs], NAMES) == ("confirmed", "", True)
+    pairs = [*zip(x.writes, y.writes, strict=False)]
+    assert len(pairs) > 20
+    # One ramp: they are as far apart as one write takes, and neither is left out.
+    assert all(abs(one[1] - other[1]) <= 20.0 * 0.0081 for one, other in pairs)
+
+
+def test_an_output_of_a_line_that_is_final_is_left_alone():
+    x, y = Amplifier(), Amplifier()
+    y.clock, y.sleep, y.error = x.clock, x.sleep, DeviceError("no answer")
+    outputs = outputs_of(x, y)
+    drive_in_turn(outputs, lambda: x.now_s > 130.0, x.sleep)
+    assert [each.report.state for each in outputs] == ["confirmed", "unknown"]
+    assert len([value for _, value in x.writes if value == 0.0]) == 1
+
+
+def test_a_silent_device_does_not_delay_the_others():
+    """Each line has a thread; the one that is silent is given up last."""
+    silent = threading.Event()
+    x, y = Amplifier(), Amplifier()
+    y.make_safe = lambda value: silent.wait(30.0)
+    outputs = outputs_of(x, y)
+    make_safe = x.make_safe
+
+    def answering(value):
+        make_safe(value)
+        if value == 0.0:
+            silent.set()
+
+    x.make_safe = answering
+    drive_to_safe(outputs, x.sleep)
+    assert silent.is_set()
+    assert [each.report.state for each in outputs] == ["confirmed", "confirmed"]
+
+
+@pytest.mark.parametrize(("holds", "lines"), [
+    ([(), ()], ["x", "y"]),
+    ([("a", "b"), ("c",)], ["x", "y"]),
+    ([("a", "b"), ("b",)], ["xy"]),
+    ([("a",), ("b",), ("a", "b")], ["xyz"]),
+    ([("a",), ("b",), ("a",)], ["y", "xz"]),
+])  # fmt: skip
+def test_devices_that_share_a_resource_are_on_one_line(holds, lines):
+    devices = [SimpleNamespace(info=FakeInfo(holds=each)) for each in holds]
+    driven = [
+        SimpleNamespace(device=each, name=name) for each, name in zip(devices, "xyz", strict=False)
+    ]
+    assert ["".join(each.name for each in line) for line in lines_of(driven)] == lines
+
+
+@pytest.mark.parametrize(("states", "worst", "named"), [
+    (["confirmed", "confirmed"], "confirmed", ""),
+    (["confirmed", "unknown"], "unknown", "y"),
+    (["set", "confirmed"], "set", "x"),
+    (["sent", "set"], "sent", "xy"),
+    (["unknown", "unknown"], "unknown", "xy"),
+])  # fmt: skip
+def test_several_outputs_are_as_safe_as_the_worst_of_them(states, worst, named):
+    reports = [OutputReport(each, "", final=each == "confirmed") for each in states]
+    joint = joint_report(reports, NAMES)
+    assert (joint.state, joint.final) == (worst, named == "")
+    assert {name for name in NAMES if name in joint.error.replace("may", "")} == {*named}

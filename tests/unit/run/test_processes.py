@@ -13,12 +13,13 @@ from hilctl.base.errors import InputError, RunError
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run import processes as module
 from hilctl.run.processes import GuardianRelief, LoopProcess
-from hilctl.run.run_folder import DeviceLocks, run_folder, runs
+from hilctl.run.run_folder import DeviceLocks, OutputPlace, run_folder, runs
 from hilctl.run.shared.ring import SampleRing
 from hilctl.run.shared.shared_page import GuardianPhase, PageField, PageSlot, Phase
 from tests.fakes import held_devices
 
 HOLDS = f"tcp:10.9.8.7:{os.getpid()}"  # locks are the whole machine's
+PLACE = OutputPlace((HOLDS,), "DAC0")
 
 
 class FakeProcess:
@@ -105,9 +106,12 @@ def left(tmp_path):
     held = []
 
     def leave(*, guarded=True, recorded=True, holds=(HOLDS,)):
-        with run_folder("sine", {"": tmp_path / "a.mcap"}, 1.0, holds) as (folder, own):
+        with run_folder(
+            "sine", {"": tmp_path / "a.mcap"}, 1.0, holds, [OutputPlace(holds, "DAC0")]
+        ) as (folder, own):
             page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
             page.put(PageField.GO, 1)
+            page.put(PageField.UNANSWERED, 1)
             page.put(PageField.RECORDED, recorded)
             folder.keep(recorded=recorded)
             held.extend(os.dup(each) for each in own if guarded)
@@ -138,7 +142,7 @@ def test_a_device_is_claimed_until_its_guardian_has_released_it(left, sleeping):
         guardian.acquire()
         # A claim may come too early, and is repeated.
         sleeping += [lambda: page.put(PageField.CLAIM, 0), lambda: None, guardian.release]
-        GuardianRelief([HOLDS]).acquire(locks)
+        GuardianRelief([PLACE]).acquire(locks)
         assert guardian.holder() == HOLDS
     assert page.get(PageField.CLAIM) == 1
     assert page.get(PageField.RELIEVED) == 0
@@ -147,7 +151,7 @@ def test_a_device_is_claimed_until_its_guardian_has_released_it(left, sleeping):
 def test_waiting_for_a_guardian_has_a_limit(left, sleeping):
     left()
     with held_devices([HOLDS]), DeviceLocks([HOLDS]) as locks:
-        relief = GuardianRelief([HOLDS])
+        relief = GuardianRelief([PLACE])
         with pytest.raises(InputError, match=f"{HOLDS} is in use"):
             relief.acquire(locks)
         with pytest.raises(RunError, match="stopped"):
@@ -156,13 +160,13 @@ def test_waiting_for_a_guardian_has_a_limit(left, sleeping):
 
 def test_relieved_runs_with_unrecorded_samples_are_kept(left):
     (_, page), (missing, other) = left(), left(recorded=False)
-    relief = GuardianRelief([HOLDS])
-    relief.note_write(0.5)
+    relief = GuardianRelief([PLACE])
+    relief.note_write(PLACE, 0.5)
     relief.relieve()
     assert [each.get(PageField.RELIEVED) for each in (page, other)] == [1, 1]
     assert [each.last_safe_write() for each in (page, other)] == [0.5, 0.5]
     assert runs() == [missing]
-    assert not GuardianRelief([HOLDS]).found
+    assert not GuardianRelief([PLACE]).unanswered(PLACE)
 
 
 @pytest.mark.parametrize("settle", [
@@ -174,13 +178,13 @@ def test_a_run_whose_output_is_safe_needs_no_relief(left, settle):
     """For example, if only its samples are not yet recorded."""
     _, page = left(guarded=False, recorded=False)
     settle(page)
-    assert not GuardianRelief([HOLDS]).found
+    assert not GuardianRelief([PLACE]).unanswered(PLACE)
 
 
 def test_runs_of_other_devices_keep_their_guardians(left):
     left(holds=("tcp:10.9.8.6:502",))
-    assert not GuardianRelief([HOLDS]).found
-    assert not GuardianRelief([]).found
+    assert not GuardianRelief([PLACE]).unanswered(PLACE)
+    assert not GuardianRelief([]).unanswered(PLACE)
 
 
 def test_dead_guardians_are_started_again_with_the_lock_of_their_run(left, monkeypatch, caplog):
@@ -191,7 +195,7 @@ def test_dead_guardians_are_started_again_with_the_lock_of_their_run(left, monke
     def start_process(*words, inherits, stderr):
         started.append((words, [os.dup(each) for each in inherits]))
 
-    relief = GuardianRelief([HOLDS])
+    relief = GuardianRelief([PLACE])
     monkeypatch.setattr(module, "start_process", Mock(side_effect=OSError(12, "no memory")))
     relief.restart()
     (said,) = caplog.messages

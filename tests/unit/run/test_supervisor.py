@@ -50,7 +50,10 @@ class Run:
         loaded = SimpleNamespace(
             config=self.config, device=SimpleNamespace(info=SimpleNamespace(simulated=simulated))
         )
-        checked = SimpleNamespace(loaded=loaded, forecast=SimpleNamespace(samples=100))
+        first = SimpleNamespace(loaded=loaded, forecast=SimpleNamespace(samples=100))
+        checked = SimpleNamespace(
+            first=first, axes=[first], names=[""], config=self.config, simulated=simulated
+        )
         self.started = RunMonitor(checked, ring.page, self.child, self.safety, self.recording)
 
 

@@ -9,5 +9,5 @@ from hilctl.run.safety import guardian
 @pytest.fixture(autouse=True)
 def _no_reserve(monkeypatch):
     made = Reserve()
-    monkeypatch.setattr(made, "hold", lambda: None)
+    monkeypatch.setattr(made, "hold", lambda lines: None)
     monkeypatch.setattr(guardian, "RESERVE", made)

@@ -56,14 +56,14 @@ def experiment(tmp_path):
 
 
 def test_safe_value_of_the_experiment_is_set_and_confirmed(amplifier, experiment):
-    assert put_safe(experiment, []).to_mapping()["output_safe"] is True
-    assert put_safe(experiment, ["safe.value=-1.5"]).value == -1.5
+    assert put_safe(experiment, [])[""].to_mapping()["output_safe"] is True
+    assert put_safe(experiment, ["safe.value=-1.5"])[""].value == -1.5
     assert amplifier.asked == [0.5, -1.5]
 
 
 def test_unconfirmed_output_is_not_safe(amplifier, experiment):
     amplifier.error = "no answer"
-    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
+    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep)[""].to_mapping()
     assert (found["output_safe"], found["error"]) == (False, "no answer")
     assert (found["output_state"], found["guardian_active"]) == ("unknown", False)
     assert len(amplifier.asked) > 10  # it is tried again and again
@@ -73,7 +73,7 @@ def test_a_device_without_confirmation_is_sent_the_value(amplifier, experiment, 
     monkeypatch.setattr(
         Amplifier, "make_safe", Mock(side_effect=UnconfirmedError("it does not answer"))
     )
-    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
+    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep)[""].to_mapping()
     assert (found["output_safe"], found["output_state"]) == (False, "sent")
 
 
@@ -91,7 +91,7 @@ def test_safe_value_is_set_even_without_a_lock(
 ):
     (tmp_path / "runs").write_text("")
     monkeypatch.setenv("HILCTL_RUNS", str(tmp_path / "runs"))
-    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep).to_mapping()
+    found = put_safe(experiment, [], amplifier.clock, amplifier.sleep)[""].to_mapping()
     assert (found["output_state"], set(amplifier.asked)) == ("set", {0.5})
     assert caplog.messages
 

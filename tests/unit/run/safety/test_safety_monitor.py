@@ -57,15 +57,16 @@ class Run:
             realtime=SimpleNamespace(priority=80),
         )
         silence = silence_limits(Timing(), 0.01, simulated=simulated)
-        loaded = SimpleNamespace(config=config, device=device)
-        self.checked = SimpleNamespace(loaded=loaded, silence=silence)
+        loaded = SimpleNamespace(config=config, device=device, axis="")
+        axes = [SimpleNamespace(loaded=loaded)]
+        self.checked = SimpleNamespace(axes=axes, config=config, silence=silence)
         child = SimpleNamespace(pid=1, kill=self.kill_loop)
         monkeypatch.setattr(module, "is_stopped", lambda pid: False)
         self.priorities = []
         monkeypatch.setattr(module, "be_quick", self.priorities.append)
         monkeypatch.setattr(module, "be_ordinary", lambda: self.priorities.append(0))
         start = self.start if guarded else None
-        self.safety = SafetyMonitor(self.checked, ring, child, start, self.events.append)
+        self.safety = SafetyMonitor(self.checked, [ring], child, start, self.events.append)
 
     def make_safe(self, value):
         self.log.append(f"safe {value}")
