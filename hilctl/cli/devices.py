@@ -24,7 +24,7 @@ from hilctl.machine.diagnosis import DEFAULT_RATE_HZ, Diagnosis, diagnose, laten
 from hilctl.machine.rt_setup import Realtime
 from hilctl.machine.timer_latency import Latency
 from hilctl.run.probe import Probed
-from hilctl.run.probe import probe as read_device
+from hilctl.run.probe import probe as read_devices
 from hilctl.run.run_folder import require_linux
 
 devices_ = typer.Typer(rich_markup_mode=None)
@@ -96,11 +96,18 @@ def show(
 
 @devices_.command()
 def probe(experiment: ExperimentFile, settings: Settings = None, as_json: AsJson = False) -> None:
-    """Read an experiment's device and check its answers (nothing moves)."""
+    """Read an experiment's devices and check their answers (nothing moves)."""
     require_linux()
-    probed = read_device(experiment, settings or [])
-    print_result(asdict(probed), lambda: print_probed(probed), as_json=as_json)
-    if probed.faults:
+    axes = read_devices(experiment, settings or [])
+    values = {name: asdict(probed) for name, probed in axes.items()}
+
+    def show() -> None:
+        for name, probed in axes.items():
+            print(f"{name}: " if name else "", end="")
+            print_probed(probed)
+
+    print_result(values.get("", {"axes": values}), show, as_json=as_json)
+    if any(probed.faults for probed in axes.values()):
         raise typer.Exit(3)
 
 

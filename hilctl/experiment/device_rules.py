@@ -136,17 +136,41 @@ def clock_problems(
             yield name, broken("device", f"must have a FIFO and a latency as that of {first}")
     real = {name: each for name, each in axes.items() if not each.simulated}
     clocks = {each.holds: name for name, each in real.items() if each.buffered}
-    if block > 1 and len(clocks) > 1:
-        rule = f"must be 1: {names_text([*clocks.values()])} have clocks of their own, which drift "
+    if len(clocks) > 1 and (block > 1 or info.latency_blocks):
+        rule = f"{names_text([*clocks.values()])} have clocks of their own, which drift apart"
         hint = "two outputs of one device may stream"
-        yield first, broken("block", f"{rule}apart", str(block), hint)
-    turn_s = {name: 1.0 / each.max_rate_hz for name, each in real.items()}
-    total_s = sum(turn_s.values())
-    if len(real) > 1 and rate_hz * total_s > 1.0:
-        each_ms = ", ".join(f"{name} {1e3 * duration_s:.3g}" for name, duration_s in turn_s.items())
-        hint = f"the axes are exchanged in turn, in ms: {each_ms}"
-        rule = f"must be <= {1.0 / total_s:.4g}"
+        if info.latency_blocks:
+            yield first, broken("device", f"must not stream: {rule}", info.name, hint)
+        else:
+            yield first, broken("block", f"must be 1: {rule}", str(block), hint)
+    turn_s = [1.0 / each.max_rate_hz for each in real.values()]
+    if len(real) > 1 and rate_hz * sum(turn_s) > 1.0:
+        each_ms = list(dict.fromkeys(f"{1e3 * duration_s:.3g}" for duration_s in turn_s))
+        took = f"{names_text(each_ms)} ms{' each' if len(each_ms) == 1 else ''}"
+        hint = f"{names_text([*real])} are exchanged in turn, {took}"
+        rule = f"must be <= {_floor(1.0 / sum(turn_s)):g}"
         yield first, broken("sample_rate_hz", rule, f"{rate_hz:g}", hint)
-    for name, each in [*real.items()][:1]:
-        rule = "must be simulated in a run of several axes"
-        yield name, broken("device", rule, each.name, f"--set axis={name} runs this one alone")
+    arm_s, tick_s = sum(each.arm_s for each in real.values()), block / rate_hz
+    for name, each in real.items():
+        timeout_s, least_s = each.watchdog_timeout_s, _TIMEOUT_TICKS * tick_s
+        # A shorter one is refused on its own, see watchdog_problems.
+        if timeout_s is not None and least_s + each.arm_s <= timeout_s < least_s + arm_s:
+            rule = f"must be >= {least_s + arm_s:.3g}, {_TIMEOUT_TICKS} ticks of {tick_s:g} s and "
+            rule += f"{arm_s:.2g} s to arm the watchdogs of all axes"
+            yield name, broken("device.watchdog.timeout_s", rule, f"{timeout_s:g}")
+
+
+def link_problems(axes: Mapping[str, DeviceInfo]) -> Iterator[tuple[str, ConfigProblem]]:
+    """Yield the axes whose device shares its link with that of an earlier one."""
+    for (first, one), (second, other) in combinations(axes.items(), 2):
+        shared = sorted(set(one.holds) & set(other.holds))
+        if shared and one.output != other.output:
+            rule = f"must have a link of its own: {shared[0]} is that of {first}"
+            hint = f"--set axis={second} runs this one alone"
+            yield second, broken("device", rule, other.name, hint)
+
+
+def _floor(value: float) -> float:
+    """Return a positive number rounded down to four digits."""
+    step = 10.0 ** (math.floor(math.log10(value)) - 3)
+    return math.floor(value / step) * step

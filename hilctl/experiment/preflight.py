@@ -20,6 +20,7 @@ from hilctl.experiment.device_rules import (
     channel_problems,
     clock_problems,
     crosstalk_problems,
+    link_problems,
     output_problems,
     rate_problems,
     watchdog_problems,
@@ -243,7 +244,7 @@ def _joint_problems(loaded: Sequence[LoadedExperiment]) -> Iterator[ConfigProble
     models = {each.axis: each.model for each in loaded}
     coupled = coupling_problems(loaded[0].coupling, models, config.sample_rate_hz)
     yield from loaded[0].document.refusal(coupled).problems
-    found = [*output_problems(infos)]
+    found = [*output_problems(infos), *link_problems(infos)]
     found += crosstalk_problems({each.axis: each.config.device for each in loaded})
     found += clock_problems(infos, config.sample_rate_hz, config.block)
     found += [(loaded[0].axis, each) for each in apart_problems(config.apart, [*infos])]

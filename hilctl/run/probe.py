@@ -1,11 +1,12 @@
-"""Probe: read an experiment's device and check its values for plausibility; nothing moves."""
+"""Probe: read an experiment's devices and check their values for plausibility; nothing moves."""
 
 import math
 from dataclasses import dataclass
 from pathlib import Path
 
 from hilctl.base.device import Device, DeviceInfo, DeviceReadings, ReadableDevice
-from hilctl.experiment.load import LoadedExperiment, load_experiment
+from hilctl.base.errors import DeviceError
+from hilctl.experiment.load import LoadedExperiment, load_axes
 from hilctl.run.run_folder import DeviceLocks
 
 _ABSURD = 100.0  # A value this many ranges outside is not a signal: its bytes are decoded wrongly
@@ -30,14 +31,37 @@ class Probed:
     faults: tuple[str, ...]  # implausible values, each with a possible cause
 
 
-def probe(path: Path, settings: list[str]) -> Probed:
-    """Read a device under its lock, or open and close it; raise InputError if a run holds it."""
+def probe(path: Path, settings: list[str]) -> dict[str, Probed]:
+    """Read the device of each axis under its lock, or open and close it.
+
+    Returns:
+        The values of each axis by name; those of an experiment without axes under "".
+
+    Raises:
+        InputError: The file is not valid, or a run holds a device.
+        DeviceError: Devices did not answer; the error names their axes.
+    """
     # Reading sends no set-up steps, and a tripped watchdog stays tripped.
-    loaded = load_experiment(path, settings)
-    info = loaded.device.info
-    with DeviceLocks(info.holds) as locks:
+    axes = load_axes(path, settings)
+    found, errors = dict[str, Probed](), list[str]()
+    with DeviceLocks([name for each in axes for name in each.device.info.holds]) as locks:
         locks.acquire()
-        displacement_um, output, measured, tripped = _read(loaded, loaded.device)
+        for loaded in axes:
+            try:
+                found[loaded.axis] = _probed(loaded)
+            except DeviceError as error:
+                if not loaded.axis:
+                    raise
+                errors.append(f"{loaded.axis}: {error}")
+    if errors:
+        raise DeviceError("; ".join(errors))
+    return found
+
+
+def _probed(loaded: LoadedExperiment) -> Probed:
+    """Read the device of an axis."""
+    info = loaded.device.info
+    displacement_um, output, measured, tripped = _read(loaded, loaded.device)
     return Probed(
         name=info.name,
         description=info.description,

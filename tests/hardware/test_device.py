@@ -174,7 +174,7 @@ def distance_um(first: np.ndarray, second: np.ndarray) -> float:
 def test_answers_a_probe(request):
     """The check of ``hilctl devices probe`` passes twice in a row."""
     path = request.config.getoption("--device")
-    first, second = probe(path, []), probe(path, [])
+    first, second = probe(path, [])[""], probe(path, [])[""]
     assert first.details == second.details
     assert first.faults == second.faults == ()
     assert first.max_rate_hz >= load_experiment(path).config.sample_rate_hz

@@ -40,7 +40,7 @@ def test_probe_prints_the_answers_of_a_device(hilctl, json_of):
 
 @pytest.mark.parametrize("words", [[], ["--json"]])
 def test_implausible_answer_has_exit_code_3(monkeypatch, hilctl, words):
-    monkeypatch.setattr("hilctl.cli.devices.read_device", lambda path, settings: PROBED)
+    monkeypatch.setattr("hilctl.cli.devices.read_devices", lambda *_: {"": PROBED})
     code, shown, _ = hilctl("devices", "probe", DEMO, *words)
     assert code == 3
     assert "too far" in shown

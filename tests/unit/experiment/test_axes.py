@@ -8,7 +8,7 @@ import pytest
 from hilctl.base.axes import axis_documents, with_settings
 from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
-from hilctl.experiment.device_rules import clock_problems, output_problems
+from hilctl.experiment.device_rules import clock_problems, link_problems, output_problems
 from hilctl.experiment.load import input_files, inputs_of, load_axes, load_experiment
 from hilctl.experiment.preflight import check_axes
 
@@ -183,6 +183,7 @@ def real():
     """Return the properties of a real device with two outputs, as two axes use it."""
     info = load_experiment(CONFIGS / "modbus_labjack_t7.yaml").device.info
     assert not info.simulated
+    info = replace(info, watchdog_timeout_s=None, arm_s=0.0)
     return {"x": replace(info, output="DAC0"), "y": replace(info, output="DAC1")}
 
 
@@ -199,15 +200,39 @@ def test_real_devices_of_several_axes(real):
         return [(axis, each.key) for axis, each in clock_problems(infos, rate_hz, block)]
 
     rate_hz = real["x"].max_rate_hz
-    alone = ("x", "device")
-    assert keys(real) == [alone]
-    assert keys(real, rate_hz / 2.1) == [alone]
-    assert keys(real, rate_hz / 1.9) == [("x", "sample_rate_hz"), alone]
+    assert keys(real) == []
+    assert keys(real, rate_hz / 2.1) == []
+    assert keys(real, rate_hz / 1.9) == [("x", "sample_rate_hz")]
     fifo = {name: replace(each, buffered=True, holds=(name,)) for name, each in real.items()}
-    assert keys(fifo, block=2) == [("x", "block"), alone]
-    assert keys(fifo) == [alone]
+    assert keys(fifo, block=2) == [("x", "block")]
+    assert keys(fifo) == []
+    stream = {name: replace(each, latency_blocks=2) for name, each in fifo.items()}
+    assert keys(stream, block=2) == [("x", "device")]
     late = {"y": replace(real["y"], latency_blocks=2)}
-    assert keys(real | late) == [("y", "device"), alone]
+    assert keys(real | late) == [("y", "device")]
+    watched = {"y": replace(real["y"], watchdog_timeout_s=3.5, arm_s=0.2)}
+    assert keys(real | watched) == []
+    slow = {"x": replace(real["x"], arm_s=0.4)}
+    assert keys(real | watched | slow) == [("y", "device.watchdog.timeout_s")]
+
+
+@pytest.mark.parametrize(("rates_hz", "limit", "took"), [
+    ((952.0, 952.0), "476", "1.05 ms each"),
+    ((400.0, 97.0), "78.06", "2.5 and 10.3 ms"),
+])  # fmt: skip
+def test_the_highest_rate_of_axes_in_turn_is_stated_and_works(real, rates_hz, limit, took):
+    axes = zip(real.items(), rates_hz, strict=True)
+    infos = {name: replace(info, max_rate_hz=rate_hz) for (name, info), rate_hz in axes}
+    ((_, problem),) = clock_problems(infos, 1000.0, 1)
+    assert problem.rule == f"must be <= {limit}"
+    assert took in problem.hint
+    assert not [*clock_problems(infos, float(limit), 1)]
+
+
+def test_axes_on_one_link_are_refused(real):
+    ((axis, problem),) = link_problems(real)
+    assert (axis, problem.key) == ("y", "device")
+    assert not [*link_problems(real | {"y": replace(real["y"], holds=("tcp:other",))})]
 
 
 def test_simulated_axes_take_no_time():
@@ -223,7 +248,7 @@ def test_real_axes_are_refused_together_and_run_alone(tmp_path):
     own = tmp_path / "t7.yaml"
     own.write_text(text + "axes:\n  x: {}\n  y: {device: {output: DAC1}}\n", encoding="utf-8")
     (problem,) = refused(own)
-    assert (problem.where, problem.key) == (f"{own}:10", "device")
+    assert problem.key == "device"
     assert load_experiment(own, ["axis=x"]).config == load_experiment(path).config
 
 

@@ -46,7 +46,7 @@ def test_implausible_readings_are_reported_with_a_likely_cause(displacement_um, 
 
 
 def test_a_simulated_device_is_opened_and_closed():
-    found = probe(CONFIGS / "demo.yaml", [])
+    found = probe(CONFIGS / "demo.yaml", [])[""]
     assert found.name == "simulated_terfenol"
     assert found.displacement_um is None
     assert found.faults == ()
@@ -110,7 +110,7 @@ def test_probe_keeps_a_tripped_watchdog_tripped(rig, profile):
     probed = rig(profile, watchdog={"timeout_s": 0.5})
     probed.drive(3.0)
     probed.clock.pass_s(1.0)
-    found = probe(probed.experiment, [])
+    found = probe(probed.experiment, [])[""]
     assert probed.emulator.device.tripped
     assert found.tripped
     events = logged(probed.log)
@@ -127,7 +127,7 @@ def test_reading_and_output_are_those_of_the_rig(rig, profile):
     probed.drive(3.0)
     probed.clock.pass_s(0.5)
     writes = probed.log.read_text()
-    found = probe(probed.experiment, [])
+    found = probe(probed.experiment, [])[""]
     assert found.output == pytest.approx(3.0, abs=1e-2)
     assert found.displacement_um == pytest.approx(20.0, abs=10.0)
     assert found.measured is None
@@ -137,7 +137,7 @@ def test_reading_and_output_are_those_of_the_rig(rig, profile):
 def test_a_measured_output_is_read_too(rig):
     probed = rig("kepco_bop", reader="agilent_34970a", measure="current")
     probed.drive(3.0)
-    assert probe(probed.experiment, []).measured == pytest.approx(3.0, abs=1e-2)
+    assert probe(probed.experiment, [])[""].measured == pytest.approx(3.0, abs=1e-2)
 
 
 @pytest.mark.parametrize("query", ["readback", "error_query"])
@@ -157,13 +157,13 @@ def test_a_wrong_word_order_is_found(rig):
     probed = rig("labjack_t7")
     # 1.6 V, 3fcccccd: with its words the other way round -1.08e8 V.
     probed.emulator.rigs[0].rig.displacement_um = 20.0
-    assert probe(probed.experiment, []).displacement_um == pytest.approx(20.0)
+    assert probe(probed.experiment, [])[""].displacement_um == pytest.approx(20.0)
     profile = Path(probed.device["profile"])
     text = profile.read_text(encoding="utf-8")
     before = "AIN0: {address: 0, type: float32,"
     assert before in text
     profile.write_text(text.replace(before, before + " order: CDAB,"), encoding="utf-8")
-    found = probe(probed.experiment, [])
+    found = probe(probed.experiment, [])[""]
     assert found.displacement_um == pytest.approx(-1.345e9, rel=1e-3)
     (fault,) = found.faults
     assert fault.startswith("displacement must be")
@@ -176,3 +176,37 @@ def test_a_device_that_a_run_holds_is_not_disturbed(rig):
     place = f"tcp:127.0.0.1:{probed.device['tcp_port']}"
     with held_devices([place]), pytest.raises(InputError, match="in use"):
         probe(probed.experiment, [])
+
+
+STAGE = """
+name: stage
+sample_rate_hz: 1000
+waveform: {kind: hold, unit: A, level: 0.0, duration_s: 1.0}
+compensator: none
+limits: {peak_current_a: 5.0, slew_a_per_s: 500.0, stroke_um: [-100.0, 100.0]}
+device: {kind: simulated_terfenol}
+axes: {x: {}, y: {}}
+"""
+
+
+def test_every_axis_is_probed(tmp_path):
+    path = tmp_path / "stage.yaml"
+    path.write_text(STAGE, encoding="utf-8")
+    assert {name: each.name for name, each in probe(path, []).items()} == {
+        "x": "simulated_terfenol",
+        "y": "simulated_terfenol",
+    }
+    assert [*probe(path, ["axis=y"])] == [""]
+
+
+def test_axes_whose_devices_do_not_answer_are_named(tmp_path, monkeypatch):
+    def read(loaded, device):
+        if loaded.axis == "y":
+            raise DeviceError("no answer")
+        return None, None, math.nan, False
+
+    monkeypatch.setattr("hilctl.run.probe._read", read)
+    path = tmp_path / "stage.yaml"
+    path.write_text(STAGE, encoding="utf-8")
+    with pytest.raises(DeviceError, match=r"^y: no answer$"):
+        probe(path, [])
