@@ -32,6 +32,7 @@ if TYPE_CHECKING:
         calibrate_sensor,
         campaign,
         characterise,
+        couple,
         learn,
     )
     from hilctl.api.connection import RunConnection, connect
@@ -48,9 +49,9 @@ __all__ = [
     "ModelError", "RecordedRun", "RunConnection", "RunError", "RunTable", "SampleTable",
     "StepFaultError", "StepStoppedError", "StudyRun", "StudyStep", "WrittenExperiment",
     "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise", "check", "check_axes",
-    "compare", "connect", "contour", "export", "export_model", "figures", "frf", "identify",
-    "init", "learn", "list_runs", "load", "load_model", "read", "refine", "replay", "report_page",
-    "report_runs", "run", "spectrum", "step", "study", "summarize", "tune",
+    "compare", "connect", "contour", "couple", "export", "export_model", "figures", "frf",
+    "identify", "init", "learn", "list_runs", "load", "load_model", "read", "refine", "replay",
+    "report_page", "report_runs", "run", "spectrum", "step", "study", "summarize", "tune",
 ]  # fmt: skip
 
 
@@ -62,7 +63,8 @@ def __dir__() -> list[str]:
 if not TYPE_CHECKING:
     _OTHERS = {
         "campaigns": {
-            "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise", "learn",
+            "calibrate_amplifier", "calibrate_sensor", "campaign", "characterise", "couple",
+            "learn",
         },
         "connection": {"RunConnection", "connect"},
         "models": {"LoadedModel", "compare", "export_model", "identify", "load_model", "refine"},

@@ -1,4 +1,4 @@
-"""Calibration, and repeated runs: characterisation, campaigns, iterative learning."""
+"""Calibration, and repeated runs: characterisation, coupling, campaigns, iterative learning."""
 
 from collections.abc import Callable, Sequence
 from contextlib import nullcontext
@@ -12,6 +12,7 @@ from hilctl.base.table import Column
 from hilctl.base.yaml import Settings, texts_of
 from hilctl.experiment.load import inputs_of
 from hilctl.experiment.sections.correction import write_correction
+from hilctl.experiment.sections.coupling import Coupling, write_coupling
 from hilctl.lab.studies.calibrate import (
     CalibrationFit,
     Origin,
@@ -37,6 +38,7 @@ from hilctl.lab.studies.characterise.characterisation_runner import (
 )
 from hilctl.lab.studies.characterise.results import Characterisation, StepRow
 from hilctl.lab.studies.characterise.rig_page import characterisation_page
+from hilctl.lab.studies.couple import CouplingStudy
 from hilctl.lab.studies.learn import IlcResult, IlcRow, IlcSession
 from hilctl.lab.studies.study import StudyHost, run_study
 from hilctl.lab.studies.study_folder import prepared
@@ -183,6 +185,52 @@ def characterise(
             measured.discard()
         found = measured.characterise(file, overwrite=overwrite)
         write_text(page, characterisation_page(found), overwrite=True)
+    return found
+
+
+def couple(
+    experiment: PathLike,
+    output: PathLike,
+    *,
+    folder: PathLike | None = None,
+    settings: Settings = (),
+    highest_hz: float | None = None,
+    fast: bool = False,
+    overwrite: bool = False,
+    on_progress: Callable[[float, str], None] = _nothing,
+) -> Coupling:
+    """Identify the crosstalk between the axes of a stage, and verify its removal.
+
+    Each axis moves in turn while the others hold, then again with the coupling in use. A stopped
+    call resumes at the run where it stopped.
+
+    Args:
+        experiment: Experiment file with at least two axes, each with a compensator.
+        output: Coupling file to write.
+        folder: Folder for the recordings; default: ``OUTPUT-runs``.
+        settings: Overrides of the experiment.
+        highest_hz: Highest frequency of the motion; default: from the models and the sample rate.
+        fast: Simulate without waiting; simulated devices only.
+        overwrite: Discard earlier runs, and replace the file.
+        on_progress: Called with the fraction done (0 to 1) and the current step.
+
+    Raises:
+        InputError: An input is invalid, or a file cannot be written; nothing has moved.
+        RunError: A run ended by a fault, or a crosstalk is not a linear response.
+    """
+    file, chosen = Path(output), runs_folder(output, folder)
+    inputs = inputs_of(Path(experiment), texts_of(settings))
+    check_writable(file, overwrite=overwrite, inputs=inputs)
+    for path in recordings_in(chosen):
+        check_no_input(path, inputs)
+    finish_dead_runs()
+    coupled = CouplingStudy(Path(experiment), texts_of(settings), chosen, highest_hz)
+    host = StudyHost.of(fast=fast, on_progress=on_progress)
+    with prepared(chosen, host.sleep_s, host.on_note):
+        found = run_study(
+            coupled.study(), chosen, host, resume=not overwrite, total_s=coupled.seconds
+        )
+        write_coupling(file, found, overwrite=overwrite)
     return found
 
 

@@ -69,6 +69,7 @@ _HELP = {
             "calibrate": "Calibrate the sensor from a table, or the amplifier by small steps.",
             "characterise": "Measure a connected actuator within its limits, then identify and "
             "validate a model.",
+            "couple": "Identify the crosstalk between the axes of a stage, and verify its removal.",
         },
         "hilctl.cli.responses": {
             "frf": "Measure the frequency response of runs: gain, phase, coherence, resonance.",

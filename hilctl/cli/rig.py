@@ -1,4 +1,4 @@
-"""Commands that measure a rig: calibrate, characterise."""
+"""Commands that measure a rig: calibrate, characterise, couple."""
 
 import shlex
 import sys
@@ -24,6 +24,7 @@ from hilctl.cli.options import (
     Settings,
 )
 from hilctl.cli.output import print_json, print_result
+from hilctl.experiment.sections.coupling import Coupling
 from hilctl.experiment.sections.labels import label_settings
 from hilctl.lab.studies.calibrate import CalibrationFit
 from hilctl.lab.studies.characterise.characterisation_runner import CharacterisationPlan
@@ -240,3 +241,51 @@ def print_characterisation(result: Characterisation, model: Path | None, page: P
     if model is not None:
         print(f"model: {model}")
     print(f"page: {page}")
+
+
+def couple(
+    experiment: ExperimentFile,
+    output: Annotated[Path, typer.Option(help="Coupling file to write.")],
+    folder: RunsFolder = None,
+    settings: Settings = None,
+    highest_hz: Annotated[
+        float | None,
+        typer.Option(help="Highest frequency of the motion, Hz; default: from models and rate."),
+    ] = None,
+    fast: Fast = False,
+    overwrite: Annotated[
+        bool, typer.Option("--overwrite", help="Replace the file and all recordings of FOLDER.")
+    ] = False,
+    as_json: AsJson = False,
+) -> None:
+    """Identify the crosstalk between the axes of a stage, and verify its removal."""
+    try:
+        with progress_bar("couple", quiet=as_json) as on_progress:
+            found = api.couple(
+                experiment, output, folder=folder, settings=settings or [], fast=fast,
+                highest_hz=highest_hz, overwrite=overwrite, on_progress=on_progress,
+            )  # fmt: skip
+    except RunError as error:
+        error.add_note("the same command resumes from this run")
+        raise
+    values = {"output": str(output), **found.model_dump(mode="json")}
+    print_result(values, lambda: _print_coupling(found, output), as_json=as_json)
+
+
+def _print_coupling(found: Coupling, output: Path) -> None:
+    """Print the crosstalk of each pair of axes, the part of it that is left, and the file."""
+    pairs = [(axis, *pair) for axis, others in found.into.items() for pair in others.items()]
+    rows = [
+        (axis, other, f"{100.0 * sum(each.taps):.3g}", f"{len(each.taps)}", f"{each.coherence:.3f}",
+         f"{each.noise_percent:.2g}", f"{each.residual_percent:.2g}", each.grade)
+        for axis, other, each in pairs
+    ]  # fmt: skip
+    headings = ("sensor", "moves", "static %", "taps", "coherence", "noise %", "residual %", "fit")
+    print_rich(table("crosstalk", headings, rows, left={"moves", "fit"}))
+    for axis, other, each in pairs:
+        left = zip(each.left_hz, each.left_percent, strict=True)
+        octaves = ", ".join(f"{percent:.2g} at {hz:.3g} Hz" for hz, percent in left)
+        print(f"{axis}: left of the crosstalk of {other}, %: {octaves}")
+    if not pairs:
+        print("no crosstalk above 0.1 % of the motion and the noise")
+    print(f"coupling: {output}; set coupling to it")

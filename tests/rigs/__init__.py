@@ -17,6 +17,7 @@ DEVICES = {
     "simulated_growing_lag": "tests.rigs.devices:SimulatedGrowingLag",
     "simulated_thermal_switching": "tests.rigs.devices:SimulatedThermalSwitching",
     "simulated_leaf_stage": "tests.rigs.devices:SimulatedLeafStage",
+    "simulated_framed": "tests.rigs.frame:SimulatedFramed",
 }
 
 

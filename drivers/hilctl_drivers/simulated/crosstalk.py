@@ -70,13 +70,18 @@ class CoupledPlants:
             part = slice(start, start + self._chunk)
             arrays = zip(self._plants, commands, measured, strict=True)
             own_um = [plant.sense(command[part], read[part]) for plant, command, read in arrays]
-            seen_um = [each.copy() for each in own_um]
-            for into, of, path in self._paths:
-                seen_um[into] += path(own_um[of])
+            seen_um = self.seen(own_um)
             for plant, signal_um, found_um in zip(
                 self._plants, seen_um, displacements_um, strict=True
             ):
                 plant.read(signal_um, found_um[part])
+
+    def seen(self, own_um: Sequence[F64]) -> Sequence[F64]:
+        """Return what the sensors see of the next own displacements, float64[n] per plant."""
+        seen_um = [each.copy() for each in own_um]
+        for into, of, path in self._paths:
+            seen_um[into] += path(own_um[of])
+        return seen_um
 
     def hold(self, samples: int, commands: Sequence[float]) -> None:
         """Let sample periods pass with the outputs at ``commands``."""

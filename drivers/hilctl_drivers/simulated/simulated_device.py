@@ -287,10 +287,13 @@ class JointSimulated:
             self.close()
             raise
         plants = [device.opened_plant for device in self._devices]
-        by_axis = dict(zip(self.axes, plants, strict=True))
-        self._plants = CoupledPlants(by_axis, self._crosstalk, sample_rate_hz)
+        self._plants = self.coupled(dict(zip(self.axes, plants, strict=True)), sample_rate_hz)
         if any(outputs := [device.last_command for device in self._devices]):
             self._plants.hold(round(_SETTLING_S * sample_rate_hz), outputs)
+
+    def coupled(self, plants: Mapping[str, Plant], sample_rate_hz: float) -> CoupledPlants:
+        """Return the opened plants of the axes with their crosstalk."""
+        return CoupledPlants(plants, self._crosstalk, sample_rate_hz)
 
     def exchange(
         self,

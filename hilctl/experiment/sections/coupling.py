@@ -35,6 +35,7 @@ MOST_ROW_SUM = 0.5
 MOST_WITH_PI = 0.3
 """The same below the crossover of a PI controller."""
 
+_GRADES = {"good": 15.0, "usable": 30.0}  # largest residual of a crosstalk, percent
 _LEFT = 1e-6  # of the crosstalk, after the last iteration
 _SAME_RATE = 1e-6
 _POINTS = 1 << 15  # fewest samples of a transform
@@ -51,6 +52,12 @@ class CrosstalkFilter(StrictModel):
     residual_percent: float  # rms error of the taps at frequencies left out, of the crosstalk
     left_hz: tuple[float, ...] = ()  # centres of octaves
     left_percent: tuple[float, ...] = ()  # measured with this coupling in use, of the crosstalk
+
+    @property
+    def grade(self) -> str:
+        """``good``, ``usable`` or ``poor``, by the residual."""
+        found = (word for word, most in _GRADES.items() if self.residual_percent <= most)
+        return next(found, "poor")
 
     def response(self) -> tuple[F64, int]:
         """Return the impulse response, float64[n], and the delay of its first sample."""

@@ -219,30 +219,38 @@ def frequency_response(recording: Recording, signals: Signals | None = None) -> 
 
 def measured_lines(recording: Recording, signals: Signals) -> Lines:
     """Return the lines above the noise without a fit, see :func:`frequency_response`."""
-    columns = _columns(recording, signals)
-    segments, method = _excitation(recording)
-    if method == "sines":
-        lines = _sines(recording, segments, columns)
-    else:
-        lines, method = _broad(recording, segments[0], columns, method)
-    excited = lines.frequency_hz.size
+    lines = excited_lines(recording, signals)
+    excited = lines.excited_lines
     usable = lines.noise < _USABLE * np.abs(lines.response)
     if np.count_nonzero(usable) < _FEWEST_LINES:
         raise NoisyResponseError(
             f"{recording.path}: only {np.count_nonzero(usable)} of {excited} frequencies are above"
             f" the noise, fewer than {_FEWEST_LINES}: increase the amplitude or the duration"
         )
-    hz, excitation = lines.frequency_hz[usable], segments[0].label
-    if method == "sines":
-        excitation = f"{len(segments)} sines {hz[0]:g}-{hz[-1]:g} Hz"
+    hz, excitation = lines.frequency_hz[usable], lines.excitation
+    if lines.method == "sines":
+        excitation = f"{excited} sines {hz[0]:g}-{hz[-1]:g} Hz"
     return lines._replace(
         frequency_hz=hz,
         response=lines.response[usable],
         noise=lines.noise[usable],
         coherence=lines.coherence[usable],
-        method=method,
         excitation=excitation,
-        excited_lines=excited,
+    )
+
+
+def excited_lines(recording: Recording, signals: Signals) -> Lines:
+    """Return all excited lines, also those below the noise; see :func:`frequency_response`."""
+    columns = _columns(recording, signals)
+    segments, method = _excitation(recording)
+    if method == "sines":
+        lines = _sines(recording, segments, columns)
+    else:
+        lines, method = _broad(recording, segments[0], columns, method)
+    return lines._replace(
+        method=method,
+        excitation=segments[0].label,
+        excited_lines=lines.frequency_hz.size,
     )
 
 
