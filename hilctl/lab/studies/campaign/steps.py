@@ -232,7 +232,7 @@ class CampaignSteps:
         settings = [*self.settings, *step.settings]
         document = document_with(self.experiment, settings, files)
         kind, first = (document.value(("device", key)) for key in ("kind", "seed"))
-        if "device.seed" in self.keys or kind not in known_devices():
+        if {"device.seed", "axes"} & {*self.keys, *document.data} or kind not in known_devices():
             return settings
         field = device_class(kind).Options.model_fields.get("seed")
         first = field.default if field and first is None else first

@@ -6,7 +6,7 @@ from hilctl.base.errors import ConfigError
 from hilctl.base.files import TextFiles
 from hilctl.base.yaml import Document
 from hilctl.lab.studies.campaign.steps import CampaignFile, groups_of, points, values_of
-from tests.unit.lab.studies.campaign.conftest import CAMPAIGN
+from tests.unit.lab.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 
 
 def test_each_step_is_the_experiment_with_its_values(campaign):
@@ -29,6 +29,21 @@ def test_each_step_has_its_own_noise(campaign):
         texts[text] = {each.yaml_text for each in loaded}
     first, *others = texts.values()
     assert all(first <= other for other in others)
+
+
+def test_a_campaign_is_one_of_a_single_axis(campaign, experiment):
+    """Each axis alone, with its own noise; all of them together are refused with the cure."""
+    axes = "axes:\n  x: {device: {seed: 5}}\n  y: {device: {seed: 6}}\n"
+    experiment.write_text(EXPERIMENT + axes)
+    few = campaign()
+    with pytest.raises(ConfigError) as error:
+        few.load(few.steps[0], TextFiles())
+    assert [(each.key, each.hint) for each in error.value.problems] == [
+        ("axes", "add --set axis=x")
+    ]
+    each = campaign(CAMPAIGN + "  axis: [x, y]\n")
+    seeds = [each.load(step, TextFiles()).config.device["seed"] for step in each.steps]
+    assert len(seeds) == len(set(seeds)) == 8
 
 
 def test_seeds_that_are_varied_are_left_alone(campaign):
