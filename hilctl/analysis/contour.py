@@ -27,9 +27,11 @@ import numpy.typing as npt
 
 from hilctl.analysis.report import build_report
 from hilctl.analysis.run_metrics import RunReport
+from hilctl.analysis.steady_state import steady_part
 from hilctl.base.errors import DataError
 from hilctl.base.formatting import finite, printable, quantity, shown_briefly
 from hilctl.base.samples import NO_WAVEFORM, Flag, Samples
+from hilctl.base.segments import Segment, common_period
 from hilctl.base.types import F64, I64
 from hilctl.kernels.path import nearest_on_path
 from hilctl.recording.metadata_keys import AXES_FACT, AXIS_FACT
@@ -244,6 +246,25 @@ def contour(
     return report, tuple(part.trace() for part in parts)
 
 
+def average_contour(recordings: Sequence[Recording], segment: Segment) -> float | None:
+    """Return the peak contour error of the average cycle, in percent of the path's size.
+
+    The size is the largest peak-to-peak reference of an axis. ``segment`` has the period and the
+    steady samples that all axes have in common. None without an average cycle of each axis.
+    """
+    cycles = [steady_part(each, segment).cycle for each in recordings]
+    signals = [each.signals for each in cycles if each is not None]
+    if len(signals) < len(cycles) or len({each.shape for each in signals}) > 1:
+        return None
+    # Three cycles, because the nearest point may be in the previous or the next one.
+    path_um, points_um = (
+        np.tile(np.column_stack(each), (3, 1)) for each in zip(*signals, strict=True)
+    )
+    index = np.arange(path_um.shape[0])
+    found = _nearest((index, path_um, points_um), index.size // 3, 2 * index.size // 3)
+    return float(100.0 * found.error_um.max() / np.ptp(path_um, axis=0).max())
+
+
 @dataclass(frozen=True, slots=True)
 class _Shared:
     """Evaluated samples of one segment of each axis, and the periods of its waveforms."""
@@ -263,14 +284,9 @@ class _Shared:
 
     def traced(self) -> int:
         """Return the samples of whole cycles of all axes; all samples without these."""
-        longest, whole = max(self.periods), self.stop - self.start
-        for cycles in range(1, _MOST_CYCLES + 1):
-            turns = [cycles * longest / each for each in self.periods if each > 0.0]
-            if len(turns) == len(self.periods) and all(
-                abs(each - round(each)) < 1e-6 for each in turns
-            ):
-                return min(math.ceil(cycles * longest) + 1, whole)
-        return whole
+        whole = self.stop - self.start
+        period = common_period(self.periods, min(whole, _MOST_CYCLES * max(self.periods)))
+        return whole if period is None else min(math.ceil(period) + 1, whole)
 
 
 def _overlaps(some: list[_Shared], others: list[_Shared]) -> list[_Shared]:

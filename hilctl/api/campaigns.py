@@ -44,6 +44,7 @@ from hilctl.lab.studies.study import StudyHost, run_study
 from hilctl.lab.studies.study_folder import prepared
 from hilctl.recording.run_summary import recordings_in
 from hilctl.run.control.client import finish_dead_runs
+from hilctl.run.result import recordings_of
 
 
 def _nothing(*_ignored: object) -> None:
@@ -305,7 +306,7 @@ def learn(
 
     Args:
         experiment: Experiment file (YAML).
-        output: Correction file to write.
+        output: Correction file to write; with several axes ``OUTPUT.AXIS.yaml`` for each one.
         cycles: Largest number of runs after the first.
         folder: Folder for the recordings; default: ``OUTPUT-runs``.
         settings: Overrides of the experiment.
@@ -316,17 +317,20 @@ def learn(
     Raises:
         InputError: An input is invalid, or a file cannot be written; nothing has moved.
     """
-    file, chosen = Path(output), runs_folder(output, folder)
+    chosen = runs_folder(output, folder)
     inputs = inputs_of(Path(experiment), texts_of(settings))
-    check_writable(file, overwrite=overwrite, inputs=inputs)
+    session = IlcSession(Path(experiment), texts_of(settings), chosen)
+    files = recordings_of(session.axes, Path(output))
+    for file in files.values():
+        check_writable(file, overwrite=overwrite, inputs=inputs)
     runs = [*chosen.glob("run-*.*")] if is_folder(chosen) else []
     for path in runs:
         check_no_input(path, inputs)
     if not overwrite and any(path.suffix == ".mcap" for path in runs):
         raise InputError(f"{chosen}: contains runs: choose another --folder, or use --overwrite")
-    session = IlcSession(Path(experiment), texts_of(settings), chosen)
     host = StudyHost.of(fast=fast)
     with prepared(chosen, host.sleep_s, host.on_note):
         learned = run_study(session.study(cycles, on_rows), chosen, host, resume=False)
-        write_correction(file, learned.correction, overwrite=overwrite)
+        for axis, file in files.items():
+            write_correction(file, learned.corrections[axis], overwrite=overwrite)
     return learned

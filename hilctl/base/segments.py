@@ -1,11 +1,13 @@
 """Segments of a run: its waveforms and their steady cycles, which metrics are computed on."""
 
+from collections.abc import Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
 SHORTEST_PERIOD = 1.0
 """Shortest period of a waveform in samples."""
 
+_WHOLE = 1e-6  # of a period
 _NO_LOOP = ("multisine", "random", "step", "hold")
 
 
@@ -61,3 +63,18 @@ class Segment:
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values, for a recording's metadata."""
         return asdict(self)
+
+
+def common_period(periods: Sequence[float], most: float) -> float | None:
+    """Return the least common multiple of periods, at most ``most``; None without one.
+
+    A period of 0.0 has no multiple.
+    """
+    longest = max(periods)
+    if min(periods) <= 0.0:
+        return None
+    for cycles in range(1, int(most / longest + _WHOLE) + 1):
+        turns = [cycles * longest / each for each in periods]
+        if all(abs(each - round(each)) < _WHOLE for each in turns):
+            return cycles * longest
+    return None

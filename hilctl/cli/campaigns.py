@@ -4,7 +4,7 @@ import json
 import shlex
 import signal
 import sys
-from collections.abc import Hashable, Sequence
+from collections.abc import Hashable, Mapping, Sequence
 from dataclasses import asdict
 from datetime import timedelta
 from pathlib import Path
@@ -51,6 +51,7 @@ from hilctl.lab.studies.multi_run.varied_parameter import (
     texts_of,
 )
 from hilctl.run.control.client import finish_dead_runs
+from hilctl.run.result import recordings_of
 
 Folder = Annotated[
     Path | None,
@@ -282,7 +283,9 @@ def print_campaign(result: CampaignResult) -> None:
 
 def learn(
     experiment: ExperimentFile,
-    output: Annotated[Path, typer.Option(help="Correction file to write.")],
+    output: Annotated[
+        Path, typer.Option(help="Correction file to write; OUTPUT.AXIS.yaml for each axis.")
+    ],
     cycles: Annotated[
         int, typer.Option(min=1, max=200, help="Largest number of runs after the first.")
     ] = 20,
@@ -306,8 +309,11 @@ def learn(
         overwrite=overwrite,
         on_rows=(lambda rows: None) if as_json else _print_iteration,
     )
+    files = recordings_of([*learned.corrections], output)
     values = {**learned.to_mapping(), "output": str(output), "folder": str(chosen)}
-    print_result(values, lambda: _print_learned(learned, output, chosen), as_json=as_json)
+    if "" not in files:
+        values["outputs"] = {axis: str(file) for axis, file in files.items()}
+    print_result(values, lambda: _print_learned(learned, files, chosen), as_json=as_json)
     if learned.stop_signal:
         raise typer.Exit(128 + signal.Signals(learned.stop_signal))
     if learned.fault:
@@ -316,24 +322,34 @@ def learn(
 
 def _print_iteration(rows: Sequence[IlcRow]) -> None:
     for row in rows:
-        name = f"  {row.label}" if len(rows) > 1 else ""
+        name = f"  {row.axis} {row.label}".rstrip() if len(rows) > 1 else ""
         reach = f"learning bandwidth {row.reach_hz:.0f} Hz" if row.run else "start"
         error = f"peak error {row.error_percent:.4f} % (noise floor {row.floor_percent:.4f} %)"
         print(f"run {row.run:2d}  {error}  {reach}{name}", flush=True)
+    if contour := _contour(rows):
+        print(f"run {rows[0].run:2d}  contour error {contour}", flush=True)
 
 
-def _print_learned(learned: IlcResult, output: Path, folder: Path) -> None:
-    checks = {row.label: row for row in learned.check}
-    last = {row.label: row for row in learned.rows}
+def _contour(rows: Sequence[IlcRow]) -> str:
+    """Return the contour errors of one run; empty with one axis."""
+    known = dict.fromkeys(row.contour_percent for row in rows)
+    return ", ".join(f"{percent:.4f} %" for percent in known if percent is not None)
+
+
+def _print_learned(learned: IlcResult, files: Mapping[str, Path], folder: Path) -> None:
+    checks = {(row.axis, row.label): row for row in learned.check}
+    last = {(row.axis, row.label): row for row in learned.rows}
     headings = (
         "waveform", "start %", "best %", "verified %", "floor %", "delay samples", "resonance Hz",
     )  # fmt: skip
     cycles = [
-        (each, last[each.label], checks.get(each.label)) for each in learned.correction.cycles
+        (axis, each, last[axis, each.label], checks.get((axis, each.label)))
+        for axis, correction in learned.corrections.items()
+        for each in correction.cycles
     ]
     rows = [
         (
-            cycle.label,
+            f"{axis} {cycle.label}".strip(),
             f"{cycle.start_percent:.4f}",
             f"{cycle.error_percent:.4f}",
             f"{check.error_percent:.4f}" if check else "-",
@@ -341,8 +357,13 @@ def _print_learned(learned: IlcResult, output: Path, folder: Path) -> None:
             f"{row.delay_samples:.2f}",
             f"{row.natural_hz:.0f}" if row.natural_hz else "-",
         )
-        for cycle, row, check in cycles
+        for axis, cycle, row, check in cycles
     ]
     print_rich(table(f"learned: {learned.reason}", headings, rows, wrap=True))
-    print(f"correction: {output}; runs: {folder}")
-    print(f"  --set {shlex.quote(correction_setting(output))}")
+    if contour := _contour([row for row in learned.rows if row.run == 0]):
+        print(f"contour error: start {contour}, verified {_contour(learned.check) or '-'}")
+    for axis, why in learned.alone.items():
+        print(f"{axis} is left alone: {why}")
+    print(f"correction: {', '.join(map(str, files.values()))}; runs: {folder}")
+    settings = (correction_setting(file, axis) for axis, file in files.items())
+    print(f"  {' '.join(f'--set {shlex.quote(each)}' for each in settings)}")

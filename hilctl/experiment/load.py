@@ -90,7 +90,8 @@ class LoadedExperiment:
         seed = self.device.Options.model_fields.get("seed")
         if seed is None:
             return []
-        return [f"device.seed={self.config.device.get('seed', seed.default) + number}"]
+        key = f"axes.{self.axis}.device.seed" if self.axis else "device.seed"
+        return [f"{key}={self.config.device.get('seed', seed.default) + number}"]
 
 
 def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperiment:

@@ -279,8 +279,8 @@ def check(
     with _refused(loaded, "waveform", problems):
         reference = build(config.waveform, config.sample_rate_hz, loaded.folder, rest)
         reference = reference.held(hold_until)
-    if crosstalk_um is not None:
-        reference = replace(reference, repeats=())  # the others may have another period
+    if crosstalk_um is not None or (loaded.correction and loaded.correction.of_several_cycles):
+        reference = replace(reference, repeats=())  # the input has the period of all axes
     _warn_of_long_work(reference)
     findings = range_findings(loaded.model, reference)
     problems += findings.refused

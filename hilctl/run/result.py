@@ -11,7 +11,7 @@ from hilctl.loop.safe_output import OutputState
 
 
 def recordings_of(names: Sequence[str], output: Path) -> dict[str, Path]:
-    """Return the recording of each axis by its name: ``output``, or NAME.x.mcap of axis x."""
+    """Return the file of each axis by its name: ``output``, or NAME.x.mcap of axis x."""
     return {
         name: output.with_name(f"{output.stem}.{name}{output.suffix}") if name else output
         for name in names

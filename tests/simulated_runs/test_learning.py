@@ -14,7 +14,7 @@ from hilctl.cli.commands import app
 from hilctl.experiment.load import load_experiment
 from hilctl.experiment.preflight import CheckedRun
 from hilctl.experiment.sections.correction import load_correction
-from hilctl.lab.studies.learn import IlcSession
+from hilctl.lab.studies.learn import IlcSession, correction_setting
 from hilctl.lab.studies.study import REPEATS, StudyHost, run_study
 from hilctl.models.linear_stages import FirstMode
 from hilctl.models.model_file import dump_model, load_model
@@ -202,3 +202,32 @@ def test_impossible_learning_is_refused_in_advance(tmp_path):
     assert "compensator: " in str(plain.exception)
     short = ["learn", str(SINE), "--set=waveform.duration_s=0.5", "--output", "c.yaml"]
     assert "2 whole cycles" in str(CliRunner().invoke(app, short).exception)
+
+
+def test_a_circle_is_learned_by_the_command(tmp_path):
+    """Two axes with crosstalk, from the same runs: contour error at most 0.15 % of the diameter.
+
+    One run uses the corrections of both.
+    """
+    stage, file = str(CONFIGS / "stage_xy.yaml"), tmp_path / "circle.yaml"
+    rig = ["waveform.duration_s=1.25"] + [
+        f"axes.{axis}.device.crosstalk={{{other}: {{gain: {gain}, natural_hz: 180.0}}}}"
+        for axis, other, gain in (("x", "y", 0.03), ("y", "x", 0.045))
+    ]
+    words = ["learn", stage, "--output", str(file), "--cycles", "4", "--json", "--fast"]
+    words += [word for each in rig for word in ("--set", each)]
+    found = json.loads(CliRunner().invoke(app, words, catch_exceptions=False).stdout)
+    assert found["outputs"] == {axis: str(tmp_path / f"circle.{axis}.yaml") for axis in "xy"}
+    start, *_ = found["runs"]
+    check = found["check"]
+    assert [row["axis"] for row in check] == ["x", "y"]
+    assert start["contour_percent"] > 2.5
+    assert {row["contour_percent"] for row in check} == {check[0]["contour_percent"]}
+    assert check[0]["contour_percent"] <= 0.15
+    settings = [correction_setting(Path(name), axis) for axis, name in found["outputs"].items()]
+    run = checked_run(CONFIGS / "stage_xy.yaml", [*rig, *settings])
+    result = run_unpaced(run, tmp_path / "run.mcap")
+    for path, row in zip(result.recordings, check, strict=True):
+        recording = read(path)
+        assert replay(recording).identical
+        assert summarize(recording).peak_error_percent < 1.5 * row["error_percent"]

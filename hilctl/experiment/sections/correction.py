@@ -34,7 +34,9 @@ class LearnedCycle(StrictModel):
 
     label: str  # the waveform in words
     period_samples: Annotated[float, Field(gt=0.0)]  # phase 0 is at the waveform's first sample
-    # the reference at 64 even phases
+    # cycles of the waveform in that period, which other axes share; None: one
+    waveform_cycles: Annotated[int, Field(ge=2)] | None = None
+    # the reference at 64 even phases of a cycle of the waveform
     reference_um: Annotated[tuple[float, ...], Field(min_length=PHASES, max_length=PHASES)]
     cosine_um: Annotated[tuple[float, ...], Field(min_length=1)]  # coefficients of k = 0, 1, ..
     sine_um: tuple[float, ...]  # coefficients of the same k; 0 for k = 0
@@ -50,7 +52,13 @@ class LearnedCycle(StrictModel):
 
     @classmethod
     def from_coefficients(
-        cls, label: str, period: float, signature_um: F64, coefficients: C128, **figures: float
+        cls,
+        label: str,
+        period: float,
+        signature_um: F64,
+        coefficients: C128,
+        waveform_cycles: int = 1,
+        **figures: float,
     ) -> "LearnedCycle":
         """Build a cycle from complex coefficients c_k, see :attr:`coefficients`."""
         last = int(np.flatnonzero(np.abs(coefficients) > 0.0).max(initial=0))
@@ -58,6 +66,7 @@ class LearnedCycle(StrictModel):
         return cls(
             label=label,
             period_samples=period,
+            waveform_cycles=waveform_cycles if waveform_cycles > 1 else None,
             reference_um=tuple(signature_um.tolist()),
             cosine_um=tuple(kept.real.tolist()),
             sine_um=(0.0, *(-kept.imag[1:]).tolist()),
@@ -89,6 +98,11 @@ class Correction(StrictModel):
     cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]  # one per waveform
     # experiment, runs, identified delay, versions
     provenance: Mapping[str, str] = Field(default_factory=dict)
+
+    @property
+    def of_several_cycles(self) -> bool:
+        """Whether a period has several cycles of a waveform."""
+        return any(cycle.waveform_cycles for cycle in self.cycles)
 
     def added(self, reference: Reference, model: HysteresisModel | None) -> F64:
         """Return the reference of a run plus its correction: float64[n], in um.
@@ -156,7 +170,8 @@ def signature(values: F64, segment: Segment) -> F64 | None:
 def fits(cycle: LearnedCycle, values: F64, segment: Segment) -> bool:
     """Return whether a cycle was learned for a segment: same period, same reference."""
     wanted = signature(values, segment)
-    if wanted is None or not _alike(cycle.period_samples, segment.period):
+    period = cycle.period_samples / (cycle.waveform_cycles or 1)
+    if wanted is None or not _alike(period, segment.period):
         return False
     learned = np.array(cycle.reference_um)
     return bool(np.abs(wanted - learned).max() <= _TOLERANCE * np.ptp(learned))

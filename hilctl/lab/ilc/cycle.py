@@ -2,7 +2,7 @@
 
 import cmath
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from pathlib import Path
 
 import numpy as np
@@ -19,7 +19,7 @@ MAX_HARMONICS = 2000
 """Most harmonics; a bin of the average cycle is then a quarter of the shortest one."""
 
 _FEWEST_CYCLES = 2
-_STRONGEST_WITHIN = 16  # harmonics
+_STRONGEST_WITHIN = 16  # harmonics of the waveform
 
 
 @dataclass(frozen=True, slots=True)
@@ -63,8 +63,14 @@ class CycleScore:
         return 100.0 * self.floor_um / self.peak_to_peak_um
 
 
-def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> CycleScore:
-    """Return the error of a segment; raise DataError without motion or two whole steady cycles."""
+def cycle_error(
+    recording: Recording, segment: Segment, highest_hz: float, waveform_cycles: int = 1
+) -> CycleScore:
+    """Return the error of a segment; raise DataError without motion or two whole steady cycles.
+
+    A cycle of the error contains that many cycles of the segment's waveform.
+    """
+    segment = replace(segment, period=waveform_cycles * segment.period)
     part = steady_part(recording, segment)
     if part.cycles < _FEWEST_CYCLES:
         rule = f"{segment.label}: needs at least {_FEWEST_CYCLES} whole steady cycles"
@@ -79,7 +85,7 @@ def cycle_error(recording: Recording, segment: Segment, highest_hz: float) -> Cy
     count = harmonic_count(segment.period, step_hz, highest_hz)
     each = _each_cycle(recording.path, part, segment, count)
     scatter = np.sqrt(np.mean(np.abs(each - each.mean(axis=0)) ** 2, axis=0) / (len(each) - 1))
-    strongest_hz, answer = _answer(part, segment, step_hz)
+    strongest_hz, answer = _answer(part, segment, step_hz, waveform_cycles)
     return CycleScore(
         harmonics_um=each.mean(axis=0),
         noise_um=scatter,
@@ -112,10 +118,13 @@ def _each_cycle(path: Path, part: SteadyPart, segment: Segment, count: int) -> C
     return np.array([coefficients(since[r], segment.period, error[r], count) for r in whole])
 
 
-def _answer(part: SteadyPart, segment: Segment, step_hz: float) -> tuple[float, complex]:
+def _answer(
+    part: SteadyPart, segment: Segment, step_hz: float, waveform_cycles: int
+) -> tuple[float, complex]:
     """Return the frequency of the reference's strongest harmonic, and its response."""
     samples = part.samples
-    count = harmonic_count(segment.period, step_hz, _STRONGEST_WITHIN * step_hz)
+    highest_hz = _STRONGEST_WITHIN * waveform_cycles * step_hz
+    count = harmonic_count(segment.period, step_hz, highest_hz)
     since = samples.index - segment.start
     wanted = coefficients(since, segment.period, samples.reference_um, count)
     moved = coefficients(since, segment.period, samples.displacement_um, count)

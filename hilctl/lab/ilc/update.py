@@ -4,6 +4,9 @@ Each update subtracts the error of each harmonic, filtered by the inverse of the
 response. The bandwidth grows while the error falls. If the error grows, the next step starts from
 the best correction, with half the gain and a smaller bandwidth.
 
+The errors of axes that move at the same time depend on each other. Their learners learn from the
+same runs, and end together, with the corrections of one run.
+
 With a nearly exact compensator the response is close to a delay of some samples. The remaining
 resonance of the structure limits the bandwidth of a correction. The response is therefore a gain, a
 delay and one second-order resonance, fitted to the changes of each harmonic. If a harmonic has
@@ -142,6 +145,7 @@ _LEAST_STEP = 0.01
 AT_FLOOR = 1.2
 """Multiple of the noise floor at which learning ends."""
 
+_LEAST_FLOOR = 1e-6  # of the peak-to-peak
 _FIRST_REACH = 0.01
 """First bandwidth as a share of the sample rate; a few samples of delay are a few degrees there."""
 
@@ -190,23 +194,45 @@ class IlcState:
     done: str = ""
 
     @property
-    def best(self) -> IlcIteration:
-        """The run with the smallest peak error."""
-        return min(self.trials, key=lambda trial: trial.error.peak_um)
-
-    @property
     def closest(self) -> IlcIteration:
         """The run with the smallest rms error, which is less sensitive to noise and corners."""
         return min(self.trials, key=lambda trial: trial.error.rms_um)
 
 
-def learn(before: IlcState, error: CycleScore) -> IlcState:
-    """Return the next state, from the error of the run with ``before.next_um``."""
+def learn(before: Sequence[IlcState], errors: Sequence[CycleScore]) -> tuple[IlcState, ...]:
+    """Return the next states of learners, from their errors in the run with each ``next_um``."""
+    states = tuple(map(_learned, before, errors))
+    reason = _done(states)
+    return _ended(states, reason) if reason else states
+
+
+def best_run(states: Sequence[IlcState]) -> int:
+    """Return the number of the run with the smallest error, see :func:`_scores`."""
+    return int(np.argmin(_scores(states)))
+
+
+def _scores(states: Sequence[IlcState]) -> F64:
+    """Return the largest peak error of each run over the learner's noise floor: float64[runs]."""
+    starts = [state.trials[0].error for state in states]
+    floors_um = [max(each.floor_um, _LEAST_FLOOR * each.peak_to_peak_um) for each in starts]
+    peaks_um = np.array([[trial.error.peak_um for trial in state.trials] for state in states])
+    scores: F64 = (peaks_um / np.array(floors_um)[:, np.newaxis]).max(axis=0)
+    return scores
+
+
+def _ended(states: Sequence[IlcState], reason: str) -> tuple[IlcState, ...]:
+    """Return the states with the corrections of the best run; these stay in further runs."""
+    best = best_run(states)
+    return tuple(
+        replace(state, done=reason, next_um=state.trials[best].correction_um) for state in states
+    )
+
+
+def _learned(before: IlcState, error: CycleScore) -> IlcState:
+    """Return the next state of one learner."""
     trial = IlcIteration(before.next_um, error, before.reach_hz)
     state = replace(before, trials=(*before.trials, trial))
     state = replace(state, response=_response(state))
-    if reason := _done(state):
-        return replace(state, done=reason)
     if not before.trials:
         state, base = _first(state), trial
     elif error.rms_um > _WORSE * before.closest.error.rms_um:
@@ -220,15 +246,16 @@ def learn(before: IlcState, error: CycleScore) -> IlcState:
     return replace(state, next_um=_moved(state, base))
 
 
-def refused(before: IlcState) -> IlcState:
-    """Return the next state after a correction that exceeds the limits of the run."""
-    if before.done or not before.trials:
-        return before
-    base = before.closest
-    state = replace(_backed_off(before, base), gain=0.5 * before.gain)
-    if state.gain < _LEAST_STEP:
-        return replace(state, done="at a limit", next_um=state.best.correction_um)
-    return replace(state, next_um=_moved(state, base))
+def refused(before: Sequence[IlcState]) -> tuple[IlcState, ...]:
+    """Return the next states after corrections that exceed the limits of the run."""
+    if not before[0].trials:
+        return tuple(before)
+    states = tuple(
+        replace(_backed_off(state, state.closest), gain=0.5 * state.gain) for state in before
+    )
+    if min(state.gain for state in states) < _LEAST_STEP:
+        return _ended(states, "at a limit")
+    return tuple(replace(state, next_um=_moved(state, state.closest)) for state in states)
 
 
 def _first(state: IlcState) -> IlcState:
@@ -306,11 +333,12 @@ def _taper(frequency: F64, reach_hz: float) -> F64:
     return 0.5 + 0.5 * np.cos(np.pi * outside)
 
 
-def _done(state: IlcState) -> str:
-    best = state.best.error
-    if best.peak_um <= AT_FLOOR * best.floor_um:
+def _done(states: Sequence[IlcState]) -> str:
+    scores = _scores(states)
+    best = [state.trials[int(np.argmin(scores))].error for state in states]
+    if all(error.peak_um <= AT_FLOOR * error.floor_um for error in best):
         return "at the noise floor"
-    earlier = state.trials[:-_PATIENCE]
-    if earlier and best.peak_um > _WORTH * min(trial.error.peak_um for trial in earlier):
+    earlier = scores[:-_PATIENCE]
+    if earlier.size and scores.min() > _WORTH * earlier.min():
         return f"no improvement in {_PATIENCE} runs"
     return ""

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from hilctl.analysis import contour as module
-from hilctl.analysis.contour import contour
+from hilctl.analysis.contour import average_contour, contour
 from hilctl.base.errors import DataError
 from hilctl.base.samples import Flag
 from hilctl.base.segments import Segment
@@ -266,3 +266,35 @@ def test_skew_is_the_difference_of_the_times_of_exchange(circle):
         runs[name] = replace(runs[name], ticks=ticks if name == "x" else ticks.rows(first != 50))
     skew_us = contour(whole(runs))[0].skew_us
     assert skew_us == {"y": {"mean": pytest.approx(1.5 + 0.5 / 49), "max": pytest.approx(2.0)}}
+
+
+class TestAverage:
+    """The contour error of the average cycle, in percent of the largest peak-to-peak reference."""
+
+    def test_a_larger_circle(self, circle):
+        runs = circle(growth_um=0.3)
+        percent = average_contour([*runs.values()], runs["x"].segments[0])
+        assert percent == pytest.approx(0.3 / (2.0 * RADIUS_UM) * 100.0, rel=1e-3)
+
+    def test_a_lag_is_no_contour_error(self, circle):
+        runs = circle(lag=0.05)
+        assert average_contour([*runs.values()], runs["x"].segments[0]) < 0.01
+
+    def test_noise_is_averaged(self, axis):
+        phase, random = angle(40 * 500, 500), np.random.default_rng(1)
+        runs = {
+            name: axis(
+                RADIUS_UM * f(phase),
+                RADIUS_UM * f(phase) + random.normal(0.0, 0.1, phase.size),
+                500,
+            )
+            for name, f in {"x": np.cos, "y": np.sin}.items()
+        }
+        percent = average_contour([*runs.values()], runs["x"].segments[0])
+        single, _ = contour(whole(runs))
+        assert percent * 0.01 * 2.0 * RADIUS_UM < 0.3 * single.peak_um
+
+    def test_without_a_cycle_there_is_none(self, circle):
+        runs = circle()
+        steady = replace(runs["x"].segments[0], steady_stop=100)
+        assert average_contour([*runs.values()], steady) is None

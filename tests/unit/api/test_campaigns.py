@@ -54,9 +54,9 @@ def test_learning_keeps_its_runs_and_writes_a_correction(tmp_path):
         "sample_rate_hz": 10000, "block": 10, "waveform.duration_s": 0.4,
         "waveform.frequency_hz": 50.0, "waveform.soft_start_s": 0.1, "waveform.soft_end_s": 0.1,
     }  # fmt: skip
-    file = tmp_path / "c.yaml"
+    file, learnable = tmp_path / "c.yaml", CONFIGS / "terfenol_sine_6a.yaml"
     learned = api.learn(
-        CONFIGS / "terfenol_sine_6a.yaml", file, cycles=1, settings=settings, fast=True,
+        learnable, file, cycles=1, settings=settings, fast=True,
         on_rows=rows.extend,
     )  # fmt: skip
     assert learned.rows[1].error_percent < learned.rows[0].error_percent
@@ -64,6 +64,6 @@ def test_learning_keeps_its_runs_and_writes_a_correction(tmp_path):
     assert file.exists()
     assert (tmp_path / "c-runs" / "run-00.mcap").exists()
     with pytest.raises(InputError, match="exists"):
-        api.learn(SINE, file, fast=True)
+        api.learn(learnable, file, fast=True)
     with pytest.raises(InputError, match="--folder"):
-        api.learn(SINE, tmp_path / "c.yml", folder=tmp_path / "c-runs", fast=True)
+        api.learn(learnable, tmp_path / "c.yml", folder=tmp_path / "c-runs", fast=True)

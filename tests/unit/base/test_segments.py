@@ -4,7 +4,7 @@ import json
 
 import pytest
 
-from hilctl.base.segments import Segment
+from hilctl.base.segments import Segment, common_period
 
 
 def segment(steady_start: int, steady_stop: int, period: float) -> Segment:
@@ -63,3 +63,16 @@ def test_mapping_goes_through_json() -> None:
 )
 def test_steps_and_multisines_are_no_loops(label, loop):
     assert Segment(label, 0, 100, 0, 100, 10.0).is_loop == loop
+
+
+@pytest.mark.parametrize(("periods", "most", "expected"), [
+    ([100.0], 1e9, 100.0),
+    ([2500.0, 2500.0], 1e9, 2500.0),
+    ([50_000.0 / 30.0, 2500.0], 1e9, 5000.0),
+    ([50_000.0 / 30.0, 2500.0], 4999.0, None),
+    ([100.0, 101.0], 1e4, None),
+    ([100.0, 101.0], 10_100.0, 10_100.0),
+    ([100.0, 0.0], 1e9, None),
+])  # fmt: skip
+def test_common_period(periods, most, expected):
+    assert common_period(periods, most) == (expected and pytest.approx(expected))

@@ -145,13 +145,15 @@ def learn(monkeypatch, tmp_path, hilctl):
 
     def run(*words, **how):
         class Done:
+            axes = ("",)
+
             def __init__(self, experiment, settings, folder):
                 pass
 
             def study(self, cycles, on_rows):
                 on_rows([ROW])
                 yield from ()
-                return IlcResult(CORRECTION, (ROW,), (), "noise floor", **how)
+                return IlcResult({"": CORRECTION}, (ROW,), (), "noise floor", **how)
 
         monkeypatch.setattr("hilctl.api.campaigns.IlcSession", Done)
         paths = (tmp_path / "experiment.yaml", "--output", tmp_path / "correction.yaml")

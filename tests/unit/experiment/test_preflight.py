@@ -382,6 +382,20 @@ def test_what_was_learned_is_added_to_the_compensator_s_input():
     assert 0.1 < np.abs(added).max() < 1.0
 
 
+def test_a_correction_over_several_cycles_is_computed_completely():
+    """Of a long reference only the first and last cycles are computed, as if it repeated."""
+    plain = checked(DISPLACEMENT, "waveform.duration_s=60.0", model=terfenol_rdpi())
+    assert plain.reference.repeats
+    waveform = plain.reference.segments[0]
+    wanted = signature(plain.reference.values, waveform)
+    bump = 0.5 * np.exp(-1j * np.pi * np.arange(4))  # highest in the middle of a period
+    cycle = LearnedCycle.from_coefficients("sine", 600 * waveform.period, wanted, bump, 600)
+    correction = learned(plain, waveform).model_copy(update={"cycles": (cycle,)})
+    found = check(replace(plain.loaded, correction=correction))
+    assert not found.reference.repeats
+    assert found.forecast.command_max > 1.05 * plain.forecast.command_max
+
+
 def test_what_was_learned_on_another_motion_is_refused():
     plain = checked(DISPLACEMENT, model=terfenol_rdpi())
     faster = checked(DISPLACEMENT, "waveform.frequency_hz=20", model=terfenol_rdpi())

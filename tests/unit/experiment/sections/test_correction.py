@@ -103,6 +103,29 @@ def test_another_waveform_is_refused(other, tmp_path):
         correction.added(reference(other, tmp_path), None)
 
 
+def test_a_period_may_have_several_cycles_of_the_waveform(tmp_path):
+    """That of two axes: the correction repeats with it, and fits no waveform of that period."""
+    made = reference(sine(), tmp_path)
+    segment = made.segments[0]
+    cycle = LearnedCycle.from_coefficients(
+        "sine", 3.0 * segment.period, signature(made.values, segment), COEFFICIENTS, 3
+    )
+    plain = correction_for(made, segment)
+    correction = plain.model_copy(update={"cycles": (cycle,)})
+    (tmp_path / "c.yaml").write_text(dump_correction(correction))
+    back = load_correction(tmp_path / "c.yaml")
+    assert back == correction
+    added, period = correction_of(back, made), round(3.0 * segment.period)
+    np.testing.assert_allclose(
+        added[1200 : 1200 + period], added[1200 + period : 1200 + 2 * period]
+    )
+    assert np.ptp(added[1200:2000] - correction_of(plain, made)[1200:2000]) > 0.1
+    slow = reference(sine(50.0), tmp_path)
+    with pytest.raises(InputError, match="another waveform"):
+        back.added(slow, None)
+    assert "waveform_cycles" not in dump_correction(plain)
+
+
 def test_another_length_or_fade_is_the_same_waveform(tmp_path):
     made = reference(sine(), tmp_path)
     correction = correction_for(made, made.segments[0])

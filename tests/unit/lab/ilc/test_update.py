@@ -1,10 +1,22 @@
 """Learning on plants made of numbers: it converges, stops, and backs off. Fitted responses."""
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 
 from hilctl.lab.ilc.cycle import CycleScore
-from hilctl.lab.ilc.update import FIRST_GAIN, IlcChange, IlcResponse, IlcState, fit, learn, refused
+from hilctl.lab.ilc.update import (
+    FIRST_GAIN,
+    IlcChange,
+    IlcIteration,
+    IlcResponse,
+    IlcState,
+    best_run,
+    fit,
+    learn,
+    refused,
+)
 
 RATE_HZ = 50_000.0
 STEP_HZ = 100.0
@@ -57,10 +69,14 @@ def begun() -> IlcState:
 def learned(plant: Plant, cycles: int = 20) -> IlcState:
     state = begun()
     for _ in range(cycles + 1):
-        state = learn(state, plant.run(state.next_um))
+        (state,) = learn([state], [plant.run(state.next_um)])
         if state.done:
             break
     return state
+
+
+def best(state: IlcState) -> IlcIteration:
+    return state.trials[best_run([state])]
 
 
 def peaks(state: IlcState) -> list[float]:
@@ -97,46 +113,46 @@ def test_a_resonance_that_the_fit_lacks_is_learned():
 def test_it_stops_at_the_noise_floor():
     state = learned(Plant(IlcResponse()))
     assert "noise floor" in state.done
-    assert state.best.error.peak_um <= 1.2 * state.best.error.floor_um
+    assert best(state).error.peak_um <= 1.2 * best(state).error.floor_um
     assert len(state.trials) < 15
 
 
 def test_noise_alone_is_not_learned():
     plant = Plant(IlcResponse())
     plant._start[:] = 0.0
-    state = learn(begun(), plant.run(begun().next_um))
+    (state,) = learn([begun()], [plant.run(begun().next_um)])
     assert np.abs(state.next_um).max() < NOISE_UM
 
 
 def test_the_first_step_reaches_no_further_than_the_phase_is_known():
     """30 degrees of what the first answer says: 50 samples late is 30 degrees at 83 Hz."""
     quick, late = begun(), begun()
-    quick = learn(quick, Plant(IlcResponse()).run(quick.next_um))
-    late = learn(late, Plant(IlcResponse(1.0, 50.0 / RATE_HZ)).run(late.next_um))
+    (quick,) = learn([quick], [Plant(IlcResponse()).run(quick.next_um)])
+    (late,) = learn([late], [Plant(IlcResponse(1.0, 50.0 / RATE_HZ)).run(late.next_um)])
     assert quick.reach_hz == pytest.approx(500.0)
     assert late.reach_hz == pytest.approx(STEP_HZ)
 
 
 def test_the_reach_grows_while_the_error_falls():
     plant = Plant(IlcResponse())
-    state = learn(begun(), plant.run(begun().next_um))
+    (state,) = learn([begun()], [plant.run(begun().next_um)])
     beyond = 1.25 * state.reach_hz < FREQUENCY
     assert not state.next_um[beyond].any()
-    further = learn(state, plant.run(state.next_um))
+    (further,) = learn([state], [plant.run(state.next_um)])
     assert further.reach_hz > state.reach_hz
 
 
 @pytest.mark.slow
 def test_it_backs_off_to_the_best_where_the_error_grows():
     plant = Plant(IlcResponse())
-    state = learn(begun(), plant.run(begun().next_um))
-    state = learn(state, plant.run(state.next_um))
-    best = state.best
+    (state,) = learn([begun()], [plant.run(begun().next_um)])
+    (state,) = learn([state], [plant.run(state.next_um)])
+    before = best(state)
     worse = plant.run(state.next_um + 0.5)
-    after = learn(state, worse)
-    assert after.best is best
+    (after,) = learn([state], [worse])
+    assert best(after) is before
     assert after.gain == pytest.approx(0.5 * state.gain)
-    assert abs(after.next_um[0] - best.correction_um[0]) < 0.1
+    assert abs(after.next_um[0] - before.correction_um[0]) < 0.1
 
 
 @pytest.mark.slow
@@ -149,24 +165,25 @@ def test_a_plant_that_turns_the_wrong_way_does_not_run_away():
     plant._answer = np.where(FREQUENCY > 1000.0, -1.0, 1.0) * plant._answer
     state = learned(plant)
     assert max(peaks(state)) < 1.2 * peaks(state)[0]
-    assert state.best.error.peak_um < 0.5 * peaks(state)[0]
+    assert best(state).error.peak_um < 0.5 * peaks(state)[0]
 
 
 def test_a_refused_correction_is_tried_again_with_less():
-    state = learn(begun(), Plant(IlcResponse()).run(begun().next_um))
-    smaller = refused(state)
+    (state,) = learn([begun()], [Plant(IlcResponse()).run(begun().next_um)])
+    (smaller,) = refused([state])
     assert smaller.gain == pytest.approx(0.5 * FIRST_GAIN)
     assert smaller.reach_hz < state.reach_hz
     assert np.abs(smaller.next_um).sum() < np.abs(state.next_um).sum()
-    assert refused(begun()).gain == FIRST_GAIN
+    (unlearned,) = refused([begun()])
+    assert unlearned.gain == FIRST_GAIN
 
 
 def test_learning_ends_at_a_limit():
-    state = learn(begun(), Plant(IlcResponse()).run(begun().next_um))
+    (state,) = learn([begun()], [Plant(IlcResponse()).run(begun().next_um)])
     for _ in range(10):
-        state = refused(state)
+        (state,) = refused([state])
     assert state.done == "at a limit"
-    assert state.next_um is state.best.correction_um
+    assert state.next_um is best(state).correction_um
 
 
 def test_it_gives_up_where_nothing_helps():
@@ -175,6 +192,35 @@ def test_it_gives_up_where_nothing_helps():
     state = learned(plant)
     assert "5 runs" in state.done
     assert len(state.trials) == 6
+
+
+def test_axes_that_move_together_end_with_one_run():
+    """Each plant sees 10 % of the other's displacement: both errors fall, and the worst counts."""
+    plants = Plant(IlcResponse()), Plant(RESONANT)
+    plants[1]._start[:] = 0.3 * plants[1]._start
+    states = (begun(), begun())
+    while not states[0].done:
+        own = [state.next_um for state in states]
+        errors = [plant.run(own[k] + 0.1 * own[1 - k]) for k, plant in enumerate(plants)]
+        states = learn(states, errors)
+        assert len(states[0].trials) < 30
+    assert states[0].done == states[1].done
+    number = best_run(states)
+    worst = [
+        max(state.trials[k].error.peak_um / state.trials[0].error.floor_um for state in states)
+        for k in range(len(states[0].trials))
+    ]
+    assert worst[number] == min(worst) < 0.1 * worst[0]
+    for state in states:
+        assert state.next_um is state.trials[number].correction_um
+
+
+def test_refused_axes_end_together():
+    quick, slow = begun(), begun()
+    states = learn([quick, slow], [Plant(IlcResponse()).run(quick.next_um)] * 2)
+    states = (states[0], replace(states[1], gain=0.015))
+    states = refused(states)
+    assert [state.done for state in states] == ["at a limit"] * 2
 
 
 PLANT = IlcResponse(1.05, 3.0 / RATE_HZ, 1.0 / (2.0 * np.pi * 1500.0) ** 2, 0.12)
