@@ -68,15 +68,16 @@ def known_unit(text: str) -> tuple[str, float] | None:
 class RowError(DataError):
     """A row of a table is invalid."""
 
-    def __init__(self, text: str, row: int, count: int) -> None:
-        super().__init__(text)
+    def __init__(self, text: str, row: int, count: int, cure: str = "correct it") -> None:
+        super().__init__(f"{text}: {cure}")
         self.row, self.count = row, count  # its number from 1, and the number of all rows
 
     def without(self, prefix: str) -> DataError:
         """Return the error with the setting that omits the row, and fewer than half of all."""
-        end = 2 * self.row > self.count
-        setting = f"last_row={self.row - 1}" if end else f"first_row={self.row + 1}"
-        return DataError(f"{self}: correct it, or omit it with {prefix}{setting}")
+        rest, setting = "before", f"first_row={self.row + 1}"
+        if 2 * self.row > self.count:
+            rest, setting = "after", f"last_row={self.row - 1}"
+        return DataError(f"{self}, or omit it and the rows {rest} it with {prefix}{setting}")
 
 
 @dataclass(frozen=True, slots=True)
@@ -87,11 +88,13 @@ class TableRows:
         path: The file.
         values: float64[columns, rows], all finite except missing ones.
         lines: int64[rows], the line of each row in the file, or its number from 1.
+        first_row: Number of the first row, from 1.
     """
 
     path: Path
     values: F64
     lines: npt.NDArray[np.int64]
+    first_row: int = 1
 
     def sample_grid(
         self, time: int, tolerance: float, factor: float = 1.0, most_missing: float = 0.0
@@ -100,7 +103,7 @@ class TableRows:
 
         No step may differ from the median, or a multiple where rows are missing, by more than
         ``tolerance``, relative to the median. Raise DataError with the line if time does not rise,
-        or not evenly, or if more than a share ``most_missing`` of all rows is missing.
+        RowError if not evenly, or if more than a share ``most_missing`` of all rows is missing.
         """
         time_s: F64 = self.values[time] * factor
         steps = np.diff(time_s)
@@ -115,10 +118,13 @@ class TableRows:
             wrong = (np.abs(time_s - time_s[0] - mean * sample) > _LATE * mean)[1:]
         if wrong.any():
             row = int(np.argmax(wrong))
-            raise DataError(
+            raise RowError(
                 f"{self.path}:{self.lines[row + 1]}: samples must be evenly spaced in time: this "
-                f"one is {steps[row]:.6g} s after the one before, the median is {step:.6g} s. "
-                "Interpolate the table at an even time step"
+                f"one is {steps[row]:.6g} s after the one before, at {time_s[row]:.6g} s, and the "
+                f"median is {step:.6g} s",
+                self.first_row + row + 1,
+                self.first_row + steps.size,
+                "interpolate the table at an even time step",
             )
         return float(sample[-1]) / span_s, sample.astype(np.int64)
 
@@ -241,7 +247,7 @@ class ArrayTable(Table):
                 self._columns[0].size,
             )
         values[missing] = np.nan
-        return TableRows(self.path, values, first_row + np.arange(values.shape[1]))
+        return TableRows(self.path, values, first_row + np.arange(values.shape[1]), first_row)
 
 
 def _missing(values: F64) -> npt.NDArray[np.bool_]:
@@ -382,7 +388,7 @@ class TextTable(Table):
             place = self._place(lines[row], columns[column])
             raise RowError(f"{place}: {text}", first_row + int(row), len(self._rows))
         table[missing] = np.nan
-        return TableRows(self.path, np.ascontiguousarray(table.T), lines)
+        return TableRows(self.path, np.ascontiguousarray(table.T), lines, first_row)
 
     def _values(
         self,

@@ -150,8 +150,12 @@ class TableSettings(StrictModel):
     skip_rows: int = _setting(0, "Lines at the start of a text table to skip.", ge=0)
     first_row: int = _setting(1, "First data row used, from 1.", ge=1)
     last_row: int | None = _setting(None, "Last data row used; all if not set.", ge=1)
-    ignore: int = _setting(0, "Rows at the start that are simulated but not evaluated.", ge=0)
-    lag_samples: int = _setting(0, "Lag of the displacement in samples; or auto.", ge=0, le=10_000)
+    ignore: int | None = _setting(
+        None, "Rows at the start that are simulated but not evaluated.", ge=0
+    )
+    lag_samples: int = _setting(
+        0, "Lag of the displacement in samples, < 0 if it leads; or auto.", ge=-10_000, le=10_000
+    )
     find_lag: bool = _setting(False, "Select the lag with the least error.")
 
     @model_validator(mode="before")

@@ -174,7 +174,7 @@ def test_names(table, text: str, names: list[str]) -> None:
      f"t.csv:2: must have 2 columns, as the others have, got 0: '{'x' * 57}...'"),
 ])  # fmt: skip
 def test_errors_have_their_line(table, text: str, message: str) -> None:
-    assert refusal(table(text).read, [0]) == message
+    assert refusal(table(text).read, [0]) == f"{message}: correct it"
 
 
 @pytest.mark.parametrize("text", ["", " \n\t\n", "# a,b\n", "a,b\n"])
@@ -283,7 +283,7 @@ def test_lines_above_the_table_are_skipped_on_request(tmp_path):
 def test_gaps_are_counted(table):
     text = "t,x\n" + "".join(f"{k},{'nan' if k in (3, 4, 9) else k}\n" for k in range(20))
     place, rule = "t.csv:5: column 2 (x)", "must be a finite number, got nan"
-    assert refusal(table(text).read, [1]) == f"{place}: {rule}; so in 2 more rows"
+    assert refusal(table(text).read, [1]) == f"{place}: {rule}; so in 2 more rows: correct it"
 
 
 @pytest.mark.parametrize("cell", ["", "nan"])

@@ -2,7 +2,6 @@
 
 import logging
 from collections.abc import Collection, Iterable, Sequence
-from dataclasses import replace
 from itertools import chain
 from pathlib import Path
 from typing import NamedTuple, cast, get_args
@@ -14,15 +13,16 @@ from hilctl.base.samples import Flag
 from hilctl.base.table import Column, RowError, Table, open_table
 from hilctl.base.types import F64, I64, CommandUnit
 from hilctl.lab.identify.data.cycles import find_cycles, loops_from_pieces
-from hilctl.lab.identify.data.data_faults import correlation
-from hilctl.lab.identify.data.records import History, Record, turning_points
+from hilctl.lab.identify.data.data_faults import correlation, table_fault
+from hilctl.lab.identify.data.records import History, Record, from_known_state
 from hilctl.lab.identify.settings import IdentifySettings, TableSettings
 from hilctl.recording.reader import RecordingStream
 from hilctl.recording.recording import Recording
 
 _log = logging.getLogger(__name__)
 
-SLOWEST_HZ, SMALLEST_UM = 10.0, 0.5  # sample rate and stroke, below which units are in doubt
+SLOWEST_HZ, SLOWEST_ASSUMED_HZ = 10.0, 100.0  # sample rates below which s is in doubt, if assumed
+SMALLEST_UM = 0.5  # stroke below which um is in doubt
 FOLLOWS = 0.5  # correlation with the command of a displacement that is more than noise
 UNEVEN = 0.5  # maximum deviation of a time step from the median, due to rounding in text
 
@@ -57,11 +57,11 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
         parts.insert(0, f"time {_called(table, time, 's')}")
     try:
         found = table.read(wanted, settings.first_row, settings.last_row, gaps=output)
+        rate_hz, row = settings.rate_hz, np.arange(found.lines.size)
+        if rate_hz is None:
+            rate_hz, row = found.sample_grid(2, UNEVEN, per_s, MOST_MISSING)
     except RowError as error:
         raise error.without("--set table.") from None
-    rate_hz, row = settings.rate_hz, np.arange(found.lines.size)
-    if rate_hz is None:
-        rate_hz, row = found.sample_grid(2, UNEVEN, per_s, MOST_MISSING)
     every = np.arange(row[-1] + 1)
     missing = np.setdiff1d(every, row[np.isfinite(found.values[1])])
     _, displacement_um = _filled(path, row, found.values[0], found.values[1] * scale, every)
@@ -69,9 +69,10 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
     command = np.interp(every, row, found.values[0] * command_scale)
     rows = settings.first_row + np.searchsorted(row, every)
     signals = command, displacement_um
-    history = History(path.name, *signals, rate_hz, settings.ignore, missing, rows)
+    history = History(path.name, *signals, rate_hz, settings.ignore or 0, missing, rows)
     if per_s == 1.0 and times:
-        _check_rate(path, rate_hz)
+        named = table.unit(times[0])[0] == "s"
+        _check_rate(path, rate_hz, SLOWEST_HZ if named else SLOWEST_ASSUMED_HZ)
     if scale == 1.0 and settings.displacement_scale is None:
         _check_stroke(path, history)
     size = f"{found.lines.size} rows at {rate_hz:.6g} Hz"
@@ -79,9 +80,9 @@ def read_table(path: Path, settings: TableSettings) -> TableRecord:
     return TableRecord(history, cast("CommandUnit | None", unit or None), understood)
 
 
-def _check_rate(path: Path, rate_hz: float) -> None:
+def _check_rate(path: Path, rate_hz: float, slowest_hz: float) -> None:
     """Raise DataError if a time column is probably in ms."""
-    if rate_hz < SLOWEST_HZ:
+    if rate_hz < slowest_hz:
         raise DataError(
             f"{path}: {rate_hz:.4g} samples per second are few: instead of --time-column, set "
             f"--rate-hz {1e3 * rate_hz:.6g} if the time is in ms, or --rate-hz {rate_hz:.6g} if it "
@@ -175,6 +176,7 @@ def load_records(
 ) -> LoadedRecords:
     """Read recordings (``.mcap``) and tables, whose displacements lag, as records."""
     records: list[Record] = []
+    faults: list[str] = []
     known: list[str] = []
     understood: list[str] = []
     units: set[CommandUnit] = set()
@@ -192,6 +194,8 @@ def load_records(
             continue
         if first is None:
             history, unit, text = _from_table(path, settings, lag_samples)
+            if fault := table_fault(history, start=settings.table.ignore is None):
+                faults.append(f"{path}: {fault}")
             understood.append(text)
             units |= {unit} if unit else set()
             records.append(history if settings.whole else find_cycles(history, settings.points))
@@ -203,6 +207,8 @@ def load_records(
             # Excluded segments need not have a steady cycle.
             chosen = kept if left_out else ()
             records += loops_from_pieces(chain([first], pieces), settings.points, chosen)
+    if faults:
+        raise DataError("\n".join(faults))
     if len(units) > 1:
         raise InputError("recordings with commands in A and in V cannot be fitted together")
     _check_left_out(left_out, known)
@@ -226,26 +232,6 @@ def _from_table(path: Path, settings: IdentifySettings, lag_samples: int) -> Tab
         text += f"; not evaluated before {begin_s:.3g} s, because its state is unknown until then"
         history = known
     return TableRecord(history, read.unit, text)
-
-
-AT_END = 0.05  # of the range of a command: it is at an end of it
-
-
-def from_known_state(history: History) -> History:
-    """Return a history that is not evaluated until its own motion determines its state.
-
-    The state of a real actuator is unknown, also at a command of 0, until the first motion over the
-    whole range. If that motion is not in the first half, the record is used from its first turn.
-    """
-    command = history.command
-    span = float(np.ptp(command))
-    if history.ignore:
-        return history
-    ends = command <= command.min() + AT_END * span, command >= command.max() - AT_END * span
-    erased = max(int(end.argmax()) for end in ends)
-    if erased > command.size // 2:
-        erased = int(next(iter(turning_points(command)), 0))
-    return replace(history, ignore=erased) if erased <= command.size // 2 else history
 
 
 MOST_MISSING = 0.01  # share of samples

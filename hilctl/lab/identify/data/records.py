@@ -86,15 +86,15 @@ class History:
         return np.asarray(np.arange(self.command.size) / self.sample_rate_hz, dtype=np.float64)
 
     def without_lag(self, lag_samples: int) -> "History":
-        """Return the history with the displacement advanced by a lag that is not in the model."""
-        if lag_samples < 0:
-            raise DataError(f"{self.label}: lag_samples must be >= 0: {lag_samples}")
-        end = self.command.size - lag_samples
+        """Return the history with a lag of the displacement, < 0 if it leads, taken out."""
+        lead = max(-lag_samples, 0)
+        end = max(self.command.size - abs(lag_samples), 0)
+        shown = slice(max(lag_samples, 0), max(lag_samples, 0) + end)
         return replace(
             self,
-            command=np.ascontiguousarray(self.command[: max(end, 0)]),
-            displacement_um=np.ascontiguousarray(self.displacement_um[lag_samples:]),
-            rows=self.rows[lag_samples:],
+            command=np.ascontiguousarray(self.command[lead : lead + end]),
+            displacement_um=np.ascontiguousarray(self.displacement_um[shown]),
+            rows=self.rows[shown],
         )
 
     def run(self) -> tuple[F64, F64, int]:
@@ -199,6 +199,26 @@ def turning_points(command: F64) -> I64:
     moves = np.flatnonzero(steps)
     turned = np.sign(steps[moves[:-1]]) != np.sign(steps[moves[1:]])
     return np.asarray(moves[:-1][turned] + 1)
+
+
+AT_END = 0.05  # of the range of a command: it is at an end of it
+
+
+def from_known_state(history: History) -> History:
+    """Return a history that is not evaluated until its own motion determines its state.
+
+    The state of a real actuator is unknown, also at a command of 0, until the first motion over the
+    whole range. If that motion is not in the first half, the record is used from its first turn.
+    """
+    command = history.command
+    span = float(np.ptp(command))
+    if history.ignore:
+        return history
+    ends = command <= command.min() + AT_END * span, command >= command.max() - AT_END * span
+    erased = max(int(end.argmax()) for end in ends)
+    if erased > command.size // 2:
+        erased = int(next(iter(turning_points(command)), 0))
+    return replace(history, ignore=erased) if erased <= command.size // 2 else history
 
 
 def _thin(record: History, most: int) -> ThinHistory:

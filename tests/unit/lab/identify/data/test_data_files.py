@@ -262,6 +262,8 @@ def test_columns_are_known_by_their_units(tmp_path):
     [
         ("t,drive,gap", 2.0, 30.0, [{"rate_hz": 500.0}, {"rate_hz": 0.5}]),
         ("t_s,drive,gap", 2.0, 30.0, [{"rate_hz": 500.0}]),
+        ("t,drive,gap", 0.05, 30.0, [{"rate_hz": 20000.0}, {"rate_hz": 20.0}]),
+        ("t_s,drive,gap", 0.05, 30.0, []),
         ("t_ms,drive,gap_um", 200.0, 30.0, []),
         ("t,drive,gap", 0.002, 0.03, [{"displacement_scale": 1000.0}, {"displacement_scale": 1.0}]),
         ("t,drive,gap_um", 0.002, 0.03, [{"displacement_scale": 1000.0}]),
@@ -319,8 +321,29 @@ def test_missing_rows_are_interpolated_and_not_evaluated(tmp_path):
 def test_more_missing_rows_are_refused_with_the_first(tmp_path):
     lines = [f"{k / 200},{k % 50},{2 * k}" for k in range(600) if not 300 <= k < 310]
     path = write(tmp_path, ["t_s,current_a,displacement_um", *lines])
-    with pytest.raises(DataError, match=r"t\.csv:302: samples must be evenly spaced"):
+    rule = r"t\.csv:302: samples must be evenly spaced.* --set table\.last_row=300$"
+    with pytest.raises(DataError, match=rule):
         read_table(path, TableSettings())
+    assert read_table(path, TableSettings(last_row=300)).history.command.size == 300
+    assert read_table(path, TableSettings(first_row=302)).history.command.size == 289
+
+
+def test_faults_of_all_tables_are_named_before_a_fit(tmp_path):
+    command = 5.0 * np.sin(0.02 * np.arange(3000))
+    paths = []
+    for name, fault in (("a", 0), ("b", 40), ("c", -40)):
+        moved = 4.0 * command + np.where(np.arange(3000) < 900, fault, 0)
+        lines = [f"{k / 500},{command[k]:.4f},{moved[k]:.4f}" for k in range(3000)]
+        paths.append(write(tmp_path, ["t_s,drive_v,displacement_um", *lines], f"{name}.csv"))
+    settings = settings_from("ppi", [])
+    with pytest.raises(DataError) as caught:
+        load_records(paths, settings, 0)
+    first, second = str(caught.value).splitlines()
+    for path, text in zip(paths[1:], (first, second), strict=True):
+        assert text.startswith(f"{path}: ")
+        assert text.endswith("1.8 s (row 901). Use the rows after it with --set table.ignore=900")
+    confirmed = settings_from("ppi", ["table.ignore=900"])
+    assert len(load_records(paths, confirmed, 0).records) == 3
 
 
 @pytest.mark.parametrize(("bad", "rows"), [(10, 189), (190, 190)])

@@ -54,7 +54,16 @@ def test_skipped_ticks_and_the_motion_after_them_are_not_evaluated(held, left_ou
     assert set(np.flatnonzero(~history.evaluated())) == {0, 1, 2, *left_out}
 
 
-@pytest.mark.parametrize("lag", [-1, 49])
+def test_a_lag_is_taken_out_in_either_direction():
+    history = History("x", np.arange(50.0), np.arange(50.0) ** 2, 100.0, rows=1 + np.arange(50))
+    for lag, command, displacement_um in ((3, 0.0, 9.0), (-3, 3.0, 0.0)):
+        shifted = history.without_lag(lag)
+        assert shifted.command.size == shifted.displacement_um.size == 47
+        assert (shifted.command[0], shifted.displacement_um[0]) == (command, displacement_um)
+        assert shifted.rows[0] == 1 + np.sqrt(displacement_um)
+
+
+@pytest.mark.parametrize("lag", [-49, 49])
 def test_impossible_lags_are_refused(lag):
     with pytest.raises(DataError, match="x: "):
         History("x", np.arange(50.0), np.arange(50.0), 100.0).without_lag(lag)
