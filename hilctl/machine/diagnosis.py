@@ -17,6 +17,7 @@ import numpy as np
 from hilctl.base.types import I64
 from hilctl.machine.procfs import Finding, Level, Machine, login_of
 from hilctl.machine.rt_setup import ISOLATED, Realtime, cpu_numbers
+from hilctl.machine.suspend import SYSTEMD
 from hilctl.machine.timer_latency import Latency, measure
 
 _DYNAMIC = "/sys/kernel/debug/sched/preempt"
@@ -154,10 +155,21 @@ def disk_space(machine: Machine, folder: Path) -> _Found:
     return text, remedy if free < _LITTLE_SPACE_BYTES else ""
 
 
+def suspend(machine: Machine) -> _Found:
+    """Check whether this computer may suspend during a run."""
+    if not (machine.text("/sys/power/state") or "").split():
+        return "not supported by this computer", ""
+    if machine.path("/etc/systemd/system/sleep.target").is_symlink():
+        return "disabled", ""
+    if machine.path(SYSTEMD).is_dir() and machine.path("/usr/bin/systemd-inhibit").exists():
+        return "inhibited during a run, by logind", ""
+    return "possible during a run: no logind inhibits it", "disable it in the system's settings"
+
+
 def log_out(machine: Machine) -> _Found:
     """Check what systemd-logind does to a run when its user logs out."""
     user = int((machine.status("Uid") or str(os.geteuid())).split()[0])
-    if not machine.path("/run/systemd/system").is_dir():
+    if not machine.path(SYSTEMD).is_dir():
         return "no systemd: a log-out removes nothing", ""
     settings = _logind_settings(machine)
     if settings.get("KillUserProcesses", "no").lower() not in _NO:
@@ -256,6 +268,7 @@ def examine(machine: Machine, folder: Path) -> tuple[Finding, ...]:
         "serial daemons": ("warn", serial_daemons(machine)),
         "recordings": ("bad", disk_space(machine, folder)),
         "log-out": ("warn", log_out(machine)),
+        "suspend": ("warn", suspend(machine)),
     }
     return tuple(
         Finding(name, level if remedy else "ok", text, remedy)

@@ -25,6 +25,7 @@ from hilctl.experiment.preflight import CheckedRun
 from hilctl.loop.pacer import deadline_misses
 from hilctl.loop.safe_output import LoopOutcome, describe
 from hilctl.machine.rt_setup import be_ordinary, favoured
+from hilctl.machine.suspend import SUSPEND_REMEDY, SuspendDetector, SuspendInhibitor
 from hilctl.run.control.client import HANG_UP, JOB_CONTROL, STOP_SIGNAL
 from hilctl.run.control.requests import ControlServer, Requests
 from hilctl.run.job import Job
@@ -134,10 +135,12 @@ class RunMonitor:
         child: LoopProcess,
         safety: SafetyMonitor,
         recording: RingRecorder,
+        suspend: SuspendDetector,
     ) -> None:
         self._config, self._forecast = checked.config, checked.first.forecast
         self._page, self._child = page, child
         self._safety, self._recording = safety, recording
+        self._suspend, self._suspended = suspend, False
         self.outcome: LoopOutcome | None = None
         """Outcome of the run; None until the output is safe or nothing more can be done."""
         self.broke = ""
@@ -221,7 +224,14 @@ class RunMonitor:
     def _pass_stop_on(self, stop_signal: int) -> None:
         page = self._page
         must_record = self._config.recording.on_failure == "stop"
-        if stop_signal:
+        if not self._suspended and (suspended_s := self._suspend.suspended_s()):
+            self._suspended = True
+            text = f"the computer was suspended for {suspended_s:.3g} s: {SUSPEND_REMEDY}"
+            sample = page.get(PageField.NEXT_SAMPLE)
+            self._recording.record_event(Event(sample, "error", "suspended", text))
+        if self._suspended:
+            page.put(PageField.STOP, Stop.SUSPENDED)
+        elif stop_signal:
             page.put(PageField.STOP, STOPS[signal.Signals(stop_signal)])
         elif self.broke:
             page.put(PageField.STOP, Stop.SUPERVISOR_BROKE)
@@ -305,10 +315,14 @@ class Supervisor:
                     stack.enter_context(folder.description_of(axis).open("rb"))
                 inherits = locks.descriptors + own
                 child = LoopProcess(folder, page, inherits)
+                inhibitor = stack.enter_context(SuspendInhibitor(needed=bool(holds)))
                 run = folder, rings, child, recording
                 acquire = partial(relief.acquire, locks, self._raise_if_stopped)
                 safety, start_ns = self._start(stack, *run, inherits, acquire)
-                started = RunMonitor(self._checked, page, child, safety, recording)
+                suspend = SuspendDetector()
+                started = RunMonitor(self._checked, page, child, safety, recording, suspend)
+                if refusal := inhibitor.refusal():
+                    _log.warning("suspend is not inhibited: %s: %s", refusal, SUSPEND_REMEDY)
             except BaseException:
                 discard_all(recorders)
                 raise

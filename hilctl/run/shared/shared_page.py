@@ -159,6 +159,7 @@ class Stop(IntEnum):
     REQUEST = 5
     RECORDER_STALLED = 6
     SUPERVISOR_BROKE = 7
+    SUSPENDED = 8
 
     @property
     def reason(self) -> str:
@@ -174,6 +175,7 @@ _REASONS = {
     Stop.REQUEST: "stopped by hilctl stop",
     Stop.RECORDER_STALLED: "stopped because the disk stalls the recording",
     Stop.SUPERVISOR_BROKE: "stopped because the supervisor failed",
+    Stop.SUSPENDED: "stopped because the computer was suspended: nothing commanded the output",
 }
 
 

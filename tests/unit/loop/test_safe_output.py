@@ -207,7 +207,7 @@ def test_a_silent_device_does_not_delay_the_others():
     """Each line has a thread; the one that is silent is given up last."""
     silent = threading.Event()
     x, y = Amplifier(), Amplifier()
-    y.make_safe = lambda value: silent.wait(30.0)
+    y.clock, y.make_safe = x.clock, lambda value: silent.wait(30.0)
     outputs = outputs_of(x, y)
     make_safe = x.make_safe
 

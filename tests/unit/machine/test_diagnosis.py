@@ -53,7 +53,7 @@ def test_an_empty_machine_is_no_error(make_machine, tmp_path):
 def test_facts_for_a_recording(make_machine):
     facts = machine_facts(Path(), make_machine())
     assert facts["machine.kernel"] == "ok: PREEMPT_RT"
-    assert len(facts) == 11
+    assert len(facts) == 12
     assert not any(" " in name for name in facts)
 
 
@@ -65,7 +65,7 @@ def test_good_machine_has_no_remedies(make_machine):
     found = examine(make_machine(), Path())
     assert {each.level for each in found} == {"ok"}
     assert {each.remedy for each in found} == {""}
-    assert len({each.name for each in found}) == len(found) == 11
+    assert len({each.name for each in found}) == len(found) == 12
 
 
 def test_every_problem_has_a_remedy(make_machine):
@@ -81,6 +81,7 @@ def test_every_problem_has_a_remedy(make_machine):
             f"{CLOCK}/current_clocksource": "hpet",
             "/sys/bus/usb-serial/devices/ttyUSB0/latency_timer": "16",
             "/proc/1/comm": "ModemManager",
+            "/sys/power/state": "freeze mem",
         },
         closed=("/dev/ttyUSB0",),
         free=1000,
@@ -188,3 +189,23 @@ def login(monkeypatch):
 def test_settings_of_logind_are_evaluated(make_machine, login, files, level):
     _, remedy = checks.log_out(make_machine({**SYSTEMD, **files}))
     assert bool(remedy) == (level == "warn")
+
+
+@pytest.mark.parametrize(("files", "level"), [
+    ({}, "ok"),
+    ({"/sys/power/state": ""}, "ok"),
+    ({"/sys/power/state": "freeze mem"}, "warn"),
+    ({"/sys/power/state": "freeze mem", "/usr/bin/systemd-inhibit": ""}, "warn"),
+    ({"/sys/power/state": "mem", "/usr/bin/systemd-inhibit": "", **SYSTEMD}, "ok"),
+])  # fmt: skip
+def test_suspend_needs_an_inhibitor(make_machine, files, level):
+    _, remedy = checks.suspend(make_machine(files))
+    assert bool(remedy) == (level == "warn")
+
+
+def test_a_masked_suspend_needs_none(tmp_path):
+    for folder in ("sys/power", "etc/systemd/system"):
+        (tmp_path / folder).mkdir(parents=True)
+    (tmp_path / "sys/power/state").write_text("mem")
+    (tmp_path / "etc/systemd/system/sleep.target").symlink_to("/dev/null")
+    assert checks.suspend(Machine(tmp_path)) == ("disabled", "")

@@ -11,6 +11,7 @@ from types import SimpleNamespace
 import pytest
 
 from hilctl.loop.safe_output import LoopOutcome
+from hilctl.machine.suspend import SuspendDetector
 from hilctl.run import supervisor as module
 from hilctl.run.control.client import STOP_SIGNAL
 from hilctl.run.shared.ring import SampleRing
@@ -54,7 +55,11 @@ class Run:
         checked = SimpleNamespace(
             first=first, axes=[first], names=[""], config=self.config, simulated=simulated
         )
-        self.started = RunMonitor(checked, ring.page, self.child, self.safety, self.recording)
+        self.slept_ns = 0
+        self.suspend = SuspendDetector(lambda: 10**12 + self.slept_ns, lambda: 10**11)
+        self.started = RunMonitor(
+            checked, ring.page, self.child, self.safety, self.recording, self.suspend
+        )
 
 
 @pytest.fixture
@@ -91,6 +96,19 @@ def test_a_signal_has_priority_over_an_error_of_the_supervisor(run, number, stop
     run.started.break_off(ZeroDivisionError("a bug"))
     run.started.poll(number)
     assert run.page.get(PageField.STOP) == stop
+
+
+def test_a_suspend_stops_the_run_and_is_recorded_once(run):
+    run.slept_ns = 5_000_000  # less may be a correction of the clock
+    run.started.poll(0)
+    assert run.page.get(PageField.STOP) == 0
+    run.slept_ns = 3_000_000_000
+    for number in (0, STOP_SIGNAL):
+        run.started.poll(number)
+        assert run.page.get(PageField.STOP) == Stop.SUSPENDED
+    (event,) = run.ended
+    assert (event.code, event.level) == ("suspended", "error")
+    assert "3 s" in event.text
 
 
 def test_outcome_of_the_loop_counts_after_its_process_has_ended(run):
