@@ -100,7 +100,8 @@ def did_you_mean(word: str, known: Iterable[str], *, listed: bool = False) -> st
     """Return a hint with the plausible names, or with all of them unless they are ``listed``."""
     names = sorted(known)
     close = difflib.get_close_matches(word, names, n=1, cutoff=_ALIKE)
-    offered = close or [each for each in names if _is_plausible(word, each)]
+    begun = [each for each in names if len(word) > 2 and each.startswith(word.lower())]
+    offered = begun or close or [each for each in names if _is_plausible(word, each)]
     if 0 < len(offered) <= _MOST_OFFERED:
         return f"did you mean {' or '.join(map(repr, offered))}?"
     return "" if listed or not names else f"known: {', '.join(names)}"

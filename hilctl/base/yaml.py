@@ -155,6 +155,8 @@ def _hint(detail: ErrorDetails, known: Iterable[str]) -> str:
         return _number_hint(value)
     if kind in _NUMBER_TYPES and isinstance(value, float) and value.is_integer():
         return f"write {value:.0f}"
+    if kind == "tuple_type" and isinstance(value, str) and "," in value:
+        return f"write [{', '.join(part.strip() for part in value.strip('[]()').split(','))}]"
     if kind == "bool_type" and str(value).lower() in _SPOKEN_BOOLEANS:
         return "write true or false"
     if kind == "string_type" and isinstance(value, bool | int | float):

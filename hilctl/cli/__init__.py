@@ -38,6 +38,8 @@ def main() -> None:
     for name, value in OWN_ENVIRONMENT.items():
         os.environ.setdefault(name, value)
     take_verbosity(sys.argv)
+    if sys.argv[1:2] == ["help"]:
+        sys.argv[1:] = [*sys.argv[2:], "--help"]
     acts = any(name in ACTING for name in sys.argv[1:2])
     if acts and hasattr(signal, "SIGTTOU"):
         # With stty tostop, output of a background job would suspend it: a supervisor, or a command

@@ -71,8 +71,13 @@ def doctor(
 @devices_.callback(invoke_without_command=True)
 def devices(context: typer.Context, as_json: AsJson = False) -> None:
     """List devices, shipped profiles and serial ports (opens none)."""
-    if context.invoked_subcommand is not None:
-        return
+    if context.invoked_subcommand is None:
+        list_(as_json=as_json)
+
+
+@devices_.command("list", hidden=True)
+def list_(as_json: AsJson = False) -> None:
+    """List devices, shipped profiles and serial ports (opens none)."""
     listed = inventory()
     print_result(listed, lambda: print_inventory(listed), as_json=as_json)
 

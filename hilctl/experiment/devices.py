@@ -8,7 +8,8 @@ The module of a device is imported only when the device is chosen. A package add
 The guardian imports this module, so it must not import numba.
 """
 
-from collections.abc import Callable, Iterator
+import re
+from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager, suppress
 from dataclasses import dataclass
 from functools import wraps
@@ -236,16 +237,34 @@ class DeviceDescription:
     profile: dict[str, Any]  # content of the profile; empty for a device
 
 
+def found_name(name: str, known: Iterable[str]) -> str:
+    """Return the known name that a name means, in any case and with any separators."""
+    spelt = "_".join(re.findall(r"[a-z0-9]+", name.lower()))
+    return spelt if spelt in known and not is_path(name) else name
+
+
+def unknown_name(name: str, known: Sequence[str]) -> str:
+    """Return a message on an unknown device or profile: the likely ones, by name or vendor."""
+    rule = f"there is no device or profile '{name}'"
+    made = [each.name for each in profile_summaries() if name.lower() in each.device.lower()]
+    if hint := did_you_mean(name, known, listed=True) or (made and f"known: {', '.join(made)}"):
+        return f"{rule} ({hint})"
+    return (
+        f"{rule}: 'hilctl devices' lists them, and docs/howto/which_hardware.md what is not "
+        "supported, with alternatives"
+    )
+
+
 def describe(name: str) -> DeviceDescription:
     """Describe a device or a profile, not opened; raise InputError if it is unknown or invalid."""
     kinds, profiles = known_devices(), shipped_profiles()
+    name = found_name(name, [*kinds, *profiles])
     if name in profiles or is_path(name):
         path = Path(profiles.get(name, name))
         resolve_name(LOAD_PROFILE)(str(path))  # refuses an invalid profile
         return DeviceDescription(name, str(path), (), load_document(path).data)
     if name not in kinds:
-        hint = did_you_mean(name, [*kinds, *profiles])
-        raise InputError(f"there is no device or profile '{name}' ({hint})")
+        raise InputError(unknown_name(name, [*kinds, *profiles]))
     schema = options_schema(name)
     needed = schema.get("required", [])
     options = tuple(

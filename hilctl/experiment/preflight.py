@@ -321,7 +321,7 @@ def _refused(
 def _section_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
     """Yield the broken rules between the sections and the device."""
     config, rig, info = loaded.config, loaded.rig, loaded.device.info
-    yield from range_problems(config.limits, info)
+    yield from range_problems(config.limits, info, config.device)
     yield from at_start_problems(config.safe, info)
     yield from model_problems(loaded.model, info)
     yield from rate_problems(loaded.device, config.sample_rate_hz, config.block)

@@ -15,15 +15,16 @@ from typing import Any
 from hilctl.base.device import DeviceInfo, limited_range
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
-from hilctl.base.formatting import did_you_mean
 from hilctl.base.types import CommandUnit
 from hilctl.base.yaml import Document, commented, dump
 from hilctl.experiment.devices import (
     describe,
+    found_name,
     is_path,
     known_devices,
     made_device,
     shipped_profiles,
+    unknown_name,
 )
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
@@ -80,6 +81,7 @@ def starting_device(
         InputError: The name is unknown, or the device cannot drive an actuator by itself.
     """
     kinds, profiles = known_devices(), shipped_profiles()
+    name = found_name(name, [*kinds, *profiles])
     if name in kinds and not any(option.name == "profile" for option in describe(name).options):
         if reader is not None:
             raise InputError(f"--reader is for profiles: {name} reads its own sensor")
@@ -90,8 +92,7 @@ def starting_device(
         raise InputError(f"{name} takes a profile: hilctl init PROFILE ({', '.join(profiles)})")
     own = is_path(name)
     if name not in profiles and not own:
-        hint = did_you_mean(name, [*kinds, *profiles])
-        raise InputError(f"there is no device or profile '{name}' ({hint})")
+        raise InputError(unknown_name(name, [*kinds, *profiles]))
     given = dict(each.strip().split("=", 1) for each in settings if "=" in each)
     channels = {key: given[f"device.{key}"] for key in _CHANNELS if f"device.{key}" in given}
     made = resolve_name(STARTING_SECTION)(name, unit, reader, channels)

@@ -1,7 +1,7 @@
 """The ``limits`` section: settings, and the rules on device, reference and commands."""
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass
 from typing import Annotated, Any, Literal, Self
 
@@ -21,6 +21,9 @@ _TRACKING_S = 1e-3  # less than half a period at 250 Hz, and two samples on a sl
 
 
 def _interval(value: Any) -> Any:
+    if type(value) in {int, float}:
+        ends = f"[{-abs(value):g}, {abs(value):g}]"
+        raise ValueError(f"must be [lowest, highest], such as {ends}: {value:g}")
     numbers = isinstance(value, tuple) and all(isinstance(each, int | float) for each in value)
     if isinstance(value, tuple) and (len(value) != 2 or (numbers and not value[0] < value[1])):
         raise ValueError(f"must be [lowest, highest]: {list(value)}")
@@ -28,6 +31,13 @@ def _interval(value: Any) -> Any:
 
 
 Interval = Annotated[tuple[float, float], BeforeValidator(_interval)]
+
+
+def _magnitude(value: Any) -> Any:
+    if isinstance(value, tuple) and len(value) == 2:
+        ends = ", ".join(map(str, value))
+        raise ValueError(f"must be one number, for both directions: set limits.drive_a to [{ends}]")
+    return value
 
 
 class Limits(InterlockSettings):
@@ -46,7 +56,7 @@ class Limits(InterlockSettings):
             by name and in its unit. A missing value counts as outside after ``sensor_invalid_s``.
     """
 
-    peak_current_a: Annotated[float, Field(gt=0.0)] | None = None
+    peak_current_a: Annotated[float, Field(gt=0.0), BeforeValidator(_magnitude)] | None = None
     drive_a: Interval | None = None
     slew_a_per_s: Annotated[float, Field(gt=0.0)] | None = None
     drive_v: Interval | None = None
@@ -115,8 +125,13 @@ class Limits(InterlockSettings):
         return self.model_copy(update={"tracking_error_um": most_um, "tracking_s": time_s})
 
 
-def range_problems(limits: Limits, info: DeviceInfo) -> Iterator[ConfigProblem]:
-    """Yield the limits beyond the range of device and sensor."""
+def range_problems(
+    limits: Limits, info: DeviceInfo, device: Mapping[str, Any]
+) -> Iterator[ConfigProblem]:
+    """Yield the limits beyond the range of device and sensor.
+
+    ``device`` is the device's section: its scales determine both ranges.
+    """
     low, high = limits.command_range
     unit = info.command_unit
     if limits.unit != unit:
@@ -124,12 +139,26 @@ def range_problems(limits: Limits, info: DeviceInfo) -> Iterator[ConfigProblem]:
     elif low < info.command_min or high > info.command_max:
         span = f"{info.command_min:g} to {info.command_max:g} {unit}"
         rule = f"must lie within the range of {info.name}, {span}"
-        yield broken("limits", rule, f"{low:g} to {high:g}", _narrower(limits, info))
+        hint = _or_scale(_narrower(limits, info), device, "amplifier")
+        yield broken(f"limits.{limits.range_key}", rule, f"{low:g} to {high:g}", hint)
     low_um, high_um = limits.stroke_um
     if low_um < info.sensor_min_um or high_um > info.sensor_max_um:
         span = f"{info.sensor_min_um:g} to {info.sensor_max_um:g} µm"
         rule = f"must lie within the range of the sensor, {span}"
-        yield broken("limits.stroke_um", rule, f"{low_um:g} to {high_um:g}")
+        inside = max(low_um, info.sensor_min_um), min(high_um, info.sensor_max_um)
+        hint = f"set limits.stroke_um to {list(inside)!r}" if inside[0] < inside[1] else ""
+        hint = _or_scale(hint, device, "sensor")
+        yield broken("limits.stroke_um", rule, f"{low_um:g} to {high_um:g}", hint)
+
+
+def _or_scale(narrower: str, device: Mapping[str, Any], part: str) -> str:
+    """Return the hint that a scale of the device's section may be wrong, or narrower limits."""
+    scales = device.get(part)
+    if not isinstance(scales, Mapping):
+        return narrower
+    named = ", ".join(f"{key} {value}" for key, value in scales.items() if value is not None)
+    scale = f"correct device.{part} ({named}) if it is not that of your {part}"
+    return f"{scale}, or {narrower}" if narrower else scale
 
 
 def _narrower(limits: Limits, info: DeviceInfo) -> str:

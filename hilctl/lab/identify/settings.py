@@ -13,6 +13,7 @@ from pydantic.fields import FieldInfo
 
 from hilctl.base.errors import InputError
 from hilctl.base.strict import StrictModel
+from hilctl.base.table import known_unit
 from hilctl.base.types import CommandUnit
 from hilctl.lab.identify.registry import Fit, all_fits, fit_named
 from hilctl.models.kinds import FITS, known
@@ -157,6 +158,14 @@ class TableSettings(StrictModel):
         0, "Lag of the displacement in samples, < 0 if it leads; or auto.", ge=-10_000, le=10_000
     )
     find_lag: bool = _setting(False, "Select the lag with the least error.")
+
+    @field_validator("unit", mode="before")
+    @classmethod
+    def _base_unit(cls, unit: Any) -> Any:
+        base, factor = (isinstance(unit, str) and known_unit(unit)) or ("", 1.0)
+        if base in get_args(CommandUnit) and unit != base:
+            raise ValueError(f"must be A or V: for {unit} set {base}, and command_scale {factor:g}")
+        return unit
 
     @model_validator(mode="before")
     @classmethod

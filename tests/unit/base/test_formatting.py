@@ -117,6 +117,7 @@ KEYS = ("amplifier", "host", "parity", "sample_rate_hz", "serial_port", "tcp_por
         ("hyst", []),
         ("party_line", []),
         ("s", []),
+        ("SERIAL", ["serial_port"]),
     ],
 )
 def test_similar_names_are_suggested_otherwise_all(word, offered):

@@ -33,6 +33,12 @@ def test_missing_command_is_an_input_error(module, monkeypatch):
         load("emulate")
 
 
+def test_help_is_a_command_as_well():
+    shown = in_a_process(MAIN, "help", "devices", "probe")
+    assert shown.returncode == 0
+    assert shown.stdout == in_a_process(MAIN, "devices", "probe", "--help").stdout
+
+
 def test_a_clock_that_python_cannot_read_is_one_message():
     code = f"import time\ndef far(): raise OverflowError\ntime.time = far\n{MAIN}"
     ended = in_a_process(code, "list")

@@ -18,6 +18,7 @@ DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 
 def test_devices_are_listed(hilctl, json_of):
     _, listed = json_of("devices")
+    assert json_of("devices", "list") == (0, listed)
     assert "simulated_terfenol" in listed["devices"]
     assert "labjack_t7" in listed["profiles"]
     code, shown, _ = hilctl("devices")

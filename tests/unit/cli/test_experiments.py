@@ -116,7 +116,7 @@ class Terminal(io.StringIO):
      ["3 devices", "0 devices", "'DAC9'", "'kV'", "'zero'", "not 0", "-50 to 50"], {
      "device": {"host": "10.0.0.7", "output": "DAC1"}, "limits": {"peak_current_a": 0.4},
      "waveform": {"amplitude": 0.2}, }),
-    ("tdk||agilent||/dev/ttyUSB1|||5|[0, 5]", ["--reader", "must be a list"],
+    ("tdk||agilent||/dev/ttyUSB1|||5|[0, 5]", ["--reader", "[-5, 5]"],
      {"device": {"input": "AI101"}, "limits": {"drive_a": (0, 5)}}),
     ("piezo|[0, 50]", [], {"limits": {"drive_v": (0, 50)}}),
 ])  # fmt: skip

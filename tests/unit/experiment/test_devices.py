@@ -263,3 +263,21 @@ class TestSchema:
 
 def test_every_link_has_a_name():
     assert set(registry._PROTOCOLS) == set(LINK_KINDS)
+
+
+@pytest.mark.parametrize("name", ["LabJack_T7", "labjack-t7", "LABJACK T7"])
+def test_a_name_is_found_in_any_case_and_with_any_separator(name):
+    assert registry.describe(name).name == "labjack_t7"
+
+
+@pytest.mark.parametrize(("name", "offered"), [
+    ("labjack", ["labjack_t4", "labjack_t7", "labjack_t8"]),
+    ("kepco_pob", ["kepco_bop"]),
+    ("Advantech", ["adam_4024", "adam_6217"]),  # a vendor
+    ("dspace", ["which_hardware"]),
+])  # fmt: skip
+def test_unknown_names_are_answered_by_the_likely_ones(name, offered):
+    with pytest.raises(InputError) as caught:
+        registry.describe(name)
+    assert all(each in str(caught.value) for each in offered)
+    assert len(str(caught.value)) < 200

@@ -192,8 +192,10 @@ class TestDevice:
     WIDE: ClassVar = "limits.stroke_um=[-100.0, 100.0]"
 
     @pytest.mark.parametrize(("given", "problem", "rule", "allowed"), [
-        (({"command_max": 6.9},), ("limits", "-7 to 7"), "", ({"command_max": 7.0},)),
-        (({"command_min": -6.9},), ("limits", "-7 to 7"), "", ({"command_min": -7.0},)),
+        (({"command_max": 6.9},), ("limits.peak_current_a", "-7 to 7"), "",
+         ({"command_max": 7.0},)),
+        (({"command_min": -6.9},), ("limits.peak_current_a", "-7 to 7"), "",
+         ({"command_min": -7.0},)),
         (({"command_unit": "V"},), ("limits", "A"), "in V", ({},)),
         (({"max_rate_hz": 9999.0},), ("sample_rate_hz", "10000.0"), "<= 9999",
          ({"max_rate_hz": 10_000.0},)),

@@ -3,6 +3,7 @@
 import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 
 import numpy as np
 import pytest
@@ -12,7 +13,7 @@ from hilctl.base.errors import ConfigError
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import check
-from hilctl.experiment.sections.limits import Limits
+from hilctl.experiment.sections.limits import Limits, range_problems
 from hilctl.loop.interlocks import Interlocks
 from tests.published import terfenol_rdpi
 
@@ -101,6 +102,34 @@ class TestConsistency:
         keys = [f"limits.{setting.partition('=')[0]}" for setting in settings]
         assert [problem.key for problem in found] == keys
         assert all(word in problem.rule for problem in found)
+
+    @pytest.mark.parametrize(("text", "setting", "cure"), [
+        (CURRENT, "peak_current_a=[0, 9]", "set limits.drive_a to [0, 9]"),
+        (CURRENT, "stroke_um=50", "[-50, 50]"),
+        (CURRENT, "stroke_um=0,50", "write [0, 50]"),
+        (VOLTAGE, "drive_v=(0,100)", "write [0, 100]"),
+    ])  # fmt: skip
+    def test_wrong_forms_are_refused_with_the_right_one(self, text, setting, cure):
+        with pytest.raises(ConfigError) as caught:
+            loaded(text, f"limits.{setting}")
+        [problem] = caught.value.problems
+        assert problem.key == f"limits.{setting.partition('=')[0]}"
+        assert cure in str(problem)
+
+    @pytest.mark.parametrize(("limits", "section", "words"), [
+        ({"drive_v": (0.0, 100.0)}, {"amplifier": {"gain_v_per_v": 1.0}},
+         ["device.amplifier (gain_v_per_v 1.0)", "limits.drive_v to [0.0, 10.0]"]),
+        ({"drive_v": (0.0, 100.0)}, {}, ["limits.drive_v to [0.0, 10.0]"]),
+        ({"stroke_um": (-1e3, 9.0)}, {"sensor": {"um_per_v": 10.0}},
+         ["device.sensor (um_per_v 10.0)", "limits.stroke_um to [-50.0, 9.0]"]),
+    ])  # fmt: skip
+    def test_a_range_that_is_too_small_may_be_due_to_a_scale(self, limits, section, words):
+        limits = Limits(**{**STROKE, **IN_VOLTS, **limits})
+        info = SimpleNamespace(command_unit="V", name="x", command_min=0.0, command_max=10.0,
+                               sensor_min_um=-50.0, sensor_max_um=50.0)  # fmt: skip
+        found = [*range_problems(limits, info, section)][-1]
+        assert all(word in found.hint for word in words)
+        assert ("device." in found.hint) == bool(section)
 
     def test_device_that_does_not_measure(self):
         (found,) = refusals(CURRENT, "limits.measured_deviation_a=1.0", measures_command=False)

@@ -3,7 +3,12 @@
 import pytest
 from pydantic import ValidationError
 
-from hilctl.lab.identify.settings import FitSettings, IdentifySettings, setting_rows
+from hilctl.lab.identify.settings import (
+    FitSettings,
+    IdentifySettings,
+    TableSettings,
+    setting_rows,
+)
 
 
 def test_published_choices_of_a_kind_are_its_defaults():
@@ -49,3 +54,8 @@ def test_rows_have_defaults_limits_and_kinds():
     assert rows["turning_um"][:2] == ["-", ""]
     assert rows["lines"][2] == "preisach"
     assert "table.time_column" in rows
+
+
+def test_a_unit_with_a_prefix_is_refused_with_its_factor():
+    with pytest.raises(ValidationError, match=r"for mV set V, and command_scale 0\.001"):
+        TableSettings(unit="mV")
