@@ -79,10 +79,11 @@ def main() -> None:
 
 def _watch(run: RunFolder) -> None:
     """Show a run, then print how it ended, or that it is still active."""
-    feed = RunReader(run)
+    feeds = [RunReader(run, axis) for axis in run.card.axes or [""]]
+    feed = feeds[0]
     signal.signal(signal.SIGTERM, lambda number, _: sys.exit(128 + number))  # restores the terminal
     with suppress(KeyboardInterrupt):  # ends the view only
-        View(feed).show() if _has_keys() else print_lines(feed)
+        View(*feeds).show() if _has_keys() else print_lines(feed)
     reason = feed.status()["reason"] or "unknown reason"
     ended = (
         f": {feed.state}: {reason}" if feed.ended else " is still active: hilctl watch, hilctl stop"
@@ -114,10 +115,15 @@ def print_lines(feed: RunReader) -> None:
 
 
 class View:
-    """A run on the alternate screen of the terminal, with keys to stop and change it."""
+    """A run on the alternate screen of the terminal, with keys to stop and change it.
 
-    def __init__(self, feed: RunReader) -> None:
-        self.feed, self.message, self.left = feed, "", False
+    Args:
+        feeds: Readers of its axes; one is shown, and changed.
+    """
+
+    def __init__(self, *feeds: RunReader) -> None:
+        self._feeds = feeds
+        self.feed, self.message, self.left = feeds[0], "", False
         self._mark: str | None = None  # while it is typed
 
     def show(self) -> None:
@@ -131,7 +137,8 @@ class View:
             tty.setcbreak(keyboard)
             with Live(console=terminal, screen=True, auto_refresh=False) as live:
                 while not (self.left or self.feed.ended):
-                    self.feed.poll(time.monotonic())
+                    for feed in self._feeds:
+                        feed.poll(time.monotonic())
                     live.update(self.screen(terminal.height), refresh=True)
                     if select.select([keyboard], [], [], _FRAME_S)[0]:
                         self.press(os.read(keyboard, 256) or b"q")  # end of input
@@ -152,10 +159,19 @@ class View:
             self._mark = ""
         elif key in "+-":
             gain = round(self.feed.status()["gain"] + float(key + "0.1"), 6)
-            self._ask(f"gain {gain:g}", set_run, gain=gain, over_s=_OVER_S)
+            self._change(f"gain {gain:g}", gain=gain)
         elif key == "i":
             inverse = "in" if self.feed.inverse == "out" else "out"
-            self._ask(f"inverse {inverse}", set_run, inverse=inverse, over_s=_OVER_S)
+            self._change(f"inverse {inverse}", inverse=inverse)
+        elif key == "a":
+            shown = self._feeds.index(self.feed)
+            self.feed = self._feeds[(shown + 1) % len(self._feeds)]
+
+    def _change(self, what: str, **values: object) -> None:
+        """Request a change of the axis that is shown."""
+        if axis := self.feed.axis:
+            what, values = f"{axis}: {what}", {"axes": {axis: values}}
+        self._ask(what, set_run, **values, over_s=_OVER_S)
 
     def _type(self, key: str, text: str) -> None:
         if key in "\r\n\x1b":
@@ -184,7 +200,8 @@ class View:
         rows = max(1, height - _OTHER_LINES)
         events = [_event(each, self.feed) for each in self.feed.events[-rows:]]
         lines = (
-            f"{printable(status['run'])}  {status['state']}  {status['t_s']:.1f}/"
+            f"{printable(status['run'])}  {self.feed.axis and self.feed.axis + '  '}"
+            f"{status['state']}  {status['t_s']:.1f}/"
             f"{status['total_s']:.1f} s  inverse {status['inverse'] or 'none'}  "
             f"gain {status['gain']:g}  offset {status['offset']:g}",
             *_facts(status),
@@ -192,7 +209,7 @@ class View:
             + "  ".join(f"{g['name']} {g['used'] * 100:.0f} %" for g in status["gauges"]),
             *events + [""] * (rows - len(events)),
             self.message if mark is None else f"mark: {mark}_   (Enter sets it, Esc cancels)",
-            "s stop  i inverse  +- gain  m mark  q leave",
+            "s stop  i inverse  +- gain  m mark  q leave" + "  a axis" * (len(self._feeds) > 1),
         )
         return Group(*(Text(each, no_wrap=True, overflow="ellipsis") for each in lines))
 

@@ -124,7 +124,9 @@ class RunReader:
         return Scope(rate_hz, segments, self.loop_input, len(self.signals))
 
     def _take(self, traces: Traces) -> None:
-        if self._next_sample >= 0:
+        if self._next_sample < 0:
+            self._reset_at = int(traces.index[0])
+        else:
             self.missed += int(traces.index[-1]) + 1 - self._next_sample - traces.index.size
         self._next_sample = int(traces.index[-1]) + 1
         self.scope.add(traces)

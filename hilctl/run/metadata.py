@@ -226,8 +226,15 @@ class RunDescription(StrictModel):
     @classmethod
     def of(cls, checked: "CheckedExperiment") -> Self:
         """Return the description of a checked experiment."""
+        from hilctl.experiment.file import RUN_KEYS  # pydantic models of all sections
+
         loaded, reference = checked.loaded, checked.reference
         config, info = loaded.config, loaded.device.info
+        data = loaded.document.data
+        if loaded.axis:
+            own = {key: data[key] for key in data if key not in RUN_KEYS}
+            data = {key: data[key] for key in data if key in RUN_KEYS}
+            data["axes"] = {loaded.axis: own}
         return cls(
             name=config.name,
             text=config.description,
@@ -251,7 +258,7 @@ class RunDescription(StrictModel):
                 )
                 for each in loaded.rig.aux
             ],
-            settings=setting_rows(loaded.document.data),
+            settings=setting_rows(data),
         )
 
     def segments_at(self, waveform_at: int) -> list[Segment]:

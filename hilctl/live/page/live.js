@@ -20,7 +20,7 @@ const HALF_A_PIXEL = 0.5;
 const $ = (id) => document.getElementById(id);
 const token = location.hash.slice(1);
 const calm = matchMedia("(prefers-reduced-motion: reduce)");
-const view = { run: new URLSearchParams(location.search).get("run"), mode: "cycle", window_s: 2 };
+const view = { run: new URLSearchParams(location.search).get("run"), axis: null, mode: "cycle", window_s: 2, across: "", up: "", path_s: 0.5 };
 const scope = { trigger: "cycle", frozen: false, zoom: null, at: null, anchor: null, hidden: new Set(), ranges: new Map() };
 let socket = null;
 let status = null;
@@ -90,6 +90,7 @@ function said(message) {
   if (message.kind === "answer") { answered(message); return; }
   if (status?.run !== message.run) forget();
   else if (!live) notice("");
+  if (status?.axis !== message.axis) forgetAxis();
   [status, live, saidMs] = [message, true, performance.now()];
   showStatus();
 }
@@ -99,10 +100,14 @@ function forget() {
   notice("");
   say("");
   $("stop").replaceChildren("STOP ", element("kbd", "Esc"));
+  noReport = "";
+  forgetAxis();
+}
+
+function forgetAxis() {
   for (const id of ["gain", "offset"]) delete $(id).dataset.touched;
   if (scope.frozen) freeze();
   frame = shown = scope.zoom = scope.anchor = null;
-  noReport = "";
 }
 
 // ---- text and numbers
@@ -147,6 +152,7 @@ function unit(kind) {
 
 function showStatus() {
   showRuns();
+  showAxes();
   const { description } = status;
   for (const part of ["main", "footer"]) document.querySelector(part).hidden = !description;
   $("stop").disabled = Boolean(status.ended);
@@ -206,6 +212,29 @@ function showRuns() {
   }));
 }
 
+function showAxes() {
+  const { axis, axes = [] } = status;
+  const key = [status.run, axis, ...axes].join();
+  if ($("axes").dataset.key === key) return;
+  $("axes").dataset.key = key;
+  $("axes").replaceChildren(...axes.map((name) => {
+    const button = element("button", name, { type: "button", ariaPressed: String(name === axis) });
+    button.addEventListener("click", () => { view.axis = name; ask("view", { view }); });
+    return button;
+  }));
+  $("path").hidden = $("all-axes").hidden = axes.length === 0;
+  if (axes.length ? axes.includes(view.across) && axes.includes(view.up) : !view.across) return;
+  [view.across, view.up] = axes.length ? axes : ["", ""];
+  for (const end of ["across", "up"]) $(`path-${end}`).replaceChildren(...axes.map((name) => new Option(name, name, false, name === view[end])));
+  setPath();
+}
+
+function setPath() {
+  ranges.delete("path-x");
+  ranges.delete("path-y");
+  ask("view", { view });
+}
+
 function showFigures() {
   const tiles = $("tiles");
   const shownFigures = [...FIGURES, ...status.aux.map(({ name, unit: what }) => [name, name, what, 2])];
@@ -218,6 +247,8 @@ function showFigures() {
     $(`figure-${key}`).replaceChildren(number(values[key], decimals), element("small", ` ${what}`));
     $(`figure-${key}`).parentElement.hidden = key.includes("error") && status.description.waveform_unit !== "um";
   }
+  $("peak").hidden = status.description.waveform_unit !== "um";
+  $("peak-text").textContent = `peak error since ${time(status.peak_error.since_s)}: ${number(status.peak_error.um, 3, 7)} µm`;
 }
 
 function showGauges() {
@@ -279,7 +310,9 @@ function showKeys() {
   const key = JSON.stringify(rows);
   if (body.dataset.key === key) return;
   body.dataset.key = key;
-  body.replaceChildren(...rows.map((cells) => element("tr", cells.map((text) => element("td", text)))));
+  // Long keys break after a dot, not within a word.
+  const parts = (text) => text.split(/(?<=\.)/).flatMap((part) => [part, element("wbr")]);
+  body.replaceChildren(...rows.map(([name, value, when]) => element("tr", [parts(name), value, parts(when)].map((text) => element("td", text)))));
 }
 
 // ---- plots
@@ -443,11 +476,12 @@ function unpack(buffer) {
   const size = new DataView(buffer).getUint32(0, true);
   const header = JSON.parse(new TextDecoder().decode(new Uint8Array(buffer, 4, size)));
   const values = new Float32Array(buffer, 4 + size);
-  const { n, signals, loop } = header;
+  const { n, signals, loop, path } = header;
   const rows = (start) => Array.from({ length: signals }, (_, row) => values.subarray(start + row * n, start + (row + 1) * n));
   const end = n + 2 * signals * n;
   return { ...header, t: values.subarray(0, n), low: rows(n), high: rows(n + signals * n),
-    input: values.subarray(end, end + loop), output: values.subarray(end + loop, end + 2 * loop) };
+    input: values.subarray(end, end + loop), output: values.subarray(end + loop, end + 2 * loop),
+    paths: Array.from({ length: 4 }, (_, row) => values.subarray(end + 2 * loop + row * path, end + 2 * loop + (row + 1) * path)) };
 }
 
 // Each bucket is two points, its minimum and maximum, in the order of the slope (otherwise a smooth
@@ -473,6 +507,7 @@ function line(low, high, still) {
 
 function draw(data) {
   drawLoops(data);
+  if (data.path) drawPath(data.paths);
   drawScope(scope.trigger === "level" ? fromCrossing(data) : data);
 }
 
@@ -672,7 +707,28 @@ function drawLoops(data) {
   curve($("off"), data, (x, y) => y - straight(x), across, steady("off-y", low, high), inputUnit, "µm", () => 0);
 }
 
-function curve(canvas, data, value, across, up, xLabel, yLabel, straight) {
+// Reference and displacement of two axes, one µm as long across as up.
+function drawPath([acrossReference, across, upReference, up]) {
+  const range = (name, ...rows) => {
+    let low = Infinity, high = -Infinity;
+    for (const row of rows) for (const value of row) { if (value < low) low = value; if (value > high) high = value; }
+    return steady(name, low, high);
+  };
+  const { pen, toX, toY, ratio } = grid($("path-plot"), range("path-x", acrossReference, across), range("path-y", upReference, up),
+    `${view.across}, µm`, `${view.up}, µm`, true);
+  const points = (x, y) => Array.from(x, (value, at) => [toX(value), toY(y[at])]).filter(([a, b]) => !Number.isNaN(a + b));
+  pen.strokeStyle = colour("displacement");
+  pen.lineWidth = Math.max(1.6, 0.11 * letter) * ratio;
+  stroke(pen, points(across, up));
+  pen.setLineDash([6 * ratio, 4 * ratio]);
+  pen.lineWidth = ratio;
+  pen.strokeStyle = colour("reference");
+  stroke(pen, points(acrossReference, upReference));
+  pen.restore();
+}
+
+// Clears a canvas, draws the grid of two ranges, and clips to it until pen.restore().
+function grid(canvas, across, up, xLabel, yLabel, equal = false) {
   const ratio = devicePixelRatio;
   const width = Math.round(canvas.clientWidth * ratio);
   const height = Math.round(canvas.clientHeight * ratio);
@@ -680,6 +736,11 @@ function curve(canvas, data, value, across, up, xLabel, yLabel, straight) {
   const pen = canvas.getContext("2d");
   const size = letter * ratio;
   const left = 4.2 * size, bottom = 2.7 * size, top = 0.4 * size, right = 0.6 * size;
+  if (equal) {
+    const [wide, high] = [width - left - right, height - bottom - top];
+    const scale = Math.max((across[1] - across[0]) / wide, (up[1] - up[0]) / high);
+    [across, up] = [[across, wide], [up, high]].map(([[a, b], pixels]) => [(a + b - scale * pixels) / 2, (a + b + scale * pixels) / 2]);
+  }
   const toX = (x) => left + (x - across[0]) / (across[1] - across[0]) * (width - left - right);
   const toY = (y) => height - bottom - (y - up[0]) / (up[1] - up[0]) * (height - bottom - top);
   pen.clearRect(0, 0, width, height);
@@ -702,6 +763,11 @@ function curve(canvas, data, value, across, up, xLabel, yLabel, straight) {
   pen.beginPath();
   pen.rect(left, top, width - left - right, height - bottom - top);
   pen.clip();
+  return { pen, toX, toY, ratio };
+}
+
+function curve(canvas, data, value, across, up, xLabel, yLabel, straight) {
+  const { pen, toX, toY, ratio } = grid(canvas, across, up, xLabel, yLabel);
   pen.setLineDash([6 * ratio, 4 * ratio]);
   pen.strokeStyle = colour("reference");
   stroke(pen, [[toX(across[0]), toY(straight(across[0]))], [toX(across[1]), toY(straight(across[1]))]]);
@@ -797,9 +863,15 @@ function request(command, what) {
   });
 }
 
+// A change of the axis that is shown, or of all axes.
+function change(values, what) {
+  const own = status.axis && !$("all").checked;
+  request({ command: "set", ...(own ? { axes: { [status.axis]: values } } : values), over_s: typed("over") }, own ? `${status.axis}: ${what}` : what);
+}
+
 function inverse(place) {
-  const over_s = typed("over");
-  if ($("over").reportValidity()) request({ command: "set", inverse: place, over_s }, `inverse ${place}`);
+  typed("over");
+  if ($("over").reportValidity()) change({ inverse: place }, `inverse ${place}`);
 }
 
 function setTrigger(name) {
@@ -824,12 +896,15 @@ $("window").addEventListener("change", () => {
   view.window_s = Number($("window").value);
   ask("view", { view });
 });
+$("path-window").replaceChildren(...WINDOWS_S.map((seconds) => new Option(`${seconds} s`, seconds, false, seconds === view.path_s)));
+$("path-window").addEventListener("change", () => { view.path_s = Number($("path-window").value); setPath(); });
+for (const end of ["across", "up"]) $(`path-${end}`).addEventListener("change", () => { view[end] = $(`path-${end}`).value; setPath(); });
+$("reset").addEventListener("click", () => ask("reset"));
 for (const id of ["gain", "offset", "over"]) $(id).addEventListener("input", () => { $(id).dataset.touched = "1"; showChange(); });
 $("tune").addEventListener("submit", (event) => {
   event.preventDefault();
-  const [gain, offset, over_s] = ["gain", "offset", "over"].map(typed);
-  if (!$("tune").reportValidity()) return;
-  request({ command: "set", gain, offset, over_s }, `gain ${gain}, offset ${offset}`);
+  const [gain, offset] = ["gain", "offset", "over"].map(typed);
+  if ($("tune").reportValidity()) change({ gain, offset }, `gain ${gain}, offset ${offset}`);
 });
 $("marking").addEventListener("submit", (event) => {
   event.preventDefault();
@@ -876,7 +951,8 @@ function refresh(now) {
   const data = unpack(frame);
   frame = null;
   if (scope.frozen && shown) return;
-  if (!plots["plot-um"] || plots.unit !== status.run) { build(); Object.defineProperty(plots, "unit", { value: status.run }); }
+  const of = `${status.run}/${status.axis}`;
+  if (!plots["plot-um"] || plots.of !== of) { build(); Object.defineProperty(plots, "of", { value: of }); }
   draw(data);
   const gap = now - lastFrameMs;
   lastFrameMs = now;

@@ -22,8 +22,9 @@ from hilctl.run.run_folder import run_folder
 class FakeFeed:
     """A run that ends after some polls."""
 
-    def __init__(self, polls=10**9, inverse="in"):
+    def __init__(self, polls=10**9, inverse="in", axis=""):
         self.folder, self.inverse, self.loop_input = "folder", inverse, "reference"
+        self.axis = axis
         self.state, self.ended, self._polls = "running", False, polls
         self.description = SimpleNamespace(command_unit="A", sample_rate_hz=1000.0)
         self.events = [Event(1000 * k, "info", "mark", f"tap {k}") for k in range(5)]
@@ -85,6 +86,14 @@ def test_key_sends_one_request(sent, key, inverse, wanted):
     view.press(key)
     assert sent == [wanted]
     assert view.message.endswith(": done")
+
+
+def test_keys_change_the_axis_shown(sent, capsys):
+    view = View(FakeFeed(axis="x"), FakeFeed(axis="y"))
+    view.press(b"+a-a")
+    assert [each["axes"] for each in sent] == [{"x": {"gain": 0.8}}, {"y": {"gain": 0.6}}]
+    assert view.feed.axis == "x"
+    assert "a axis" in shown(view, capsys)
 
 
 def test_refused_request_is_shown(sent, monkeypatch, capsys):

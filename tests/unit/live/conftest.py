@@ -30,11 +30,20 @@ def active_run(description, place, slots=16):
         yield folder, begun(folder, description, slots)
 
 
-def begun(folder, description, slots=16):
-    """Return the ring of a run whose loop is active."""
-    description.write(folder.description_of(0))
+@contextmanager
+def active_axes(description, place, slots=16):
+    """Yield the folder and the rings of a run with the axes x and y."""
+    recordings = {axis: place / f"a.{axis}.mcap" for axis in "xy"}
+    with run_folder("stage", recordings, 12.0) as (folder, _):
+        yield folder, [begun(folder, description, slots, axis) for axis in range(2)]
+
+
+def begun(folder, description, slots=16, axis=0):
+    """Return the ring of an axis of a run whose loop is active."""
+    description.write(folder.description_of(axis))
     aux = len(description.aux)
-    ring = SampleRing.create(folder.ring, slots=slots, block=BLOCK, state_size=1, aux=aux)
+    path = folder.ring_of(axis)
+    ring = SampleRing.create(path, slots=slots, block=BLOCK, state_size=1, aux=aux)
     ring.page.put(PageField.PHASE, Phase.RUNNING)
     return ring
 

@@ -13,7 +13,7 @@ let now_ms = 0;
 
 // An element that accepts every call; only its plain values matter.
 function element() {
-  const values = { dataset: {}, style: {}, handlers: {}, kept: [], attributes: {}, hidden: false };
+  const values = { dataset: {}, style: {}, handlers: {}, kept: [], attributes: {}, hidden: false, checked: false };
   const calls = {
     append: (...more) => values.kept.push(...more),
     replaceChildren: (...more) => { values.kept = more; values.textContent = more.map((each) => each?.textContent ?? each).join(""); },

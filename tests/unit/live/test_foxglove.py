@@ -28,7 +28,7 @@ from hilctl.live.foxglove import (
 from hilctl.live.run_reader import RunReader
 from hilctl.recording.schema import TOPICS, message_class
 from hilctl.run.shared.shared_page import PageField
-from tests.unit.live.conftest import CONFIGS, active_run, exchange, first
+from tests.unit.live.conftest import CONFIGS, active_axes, active_run, exchange, first
 
 START_NS = 1_700_000_000_000_000_000
 
@@ -262,6 +262,21 @@ def test_end_of_a_run_is_not_published_during_the_next_run(description, tmp_path
             assert shown() == set()
             ring.page.put(PageField.START_NS, 1)
             assert shown() == {two.card.name}
+    finally:
+        server.run(lambda _: True)
+
+
+def test_axes_have_topics_of_their_own(description, tmp_path):
+    server = FoxgloveServer(first, port=0)
+    try:
+        with active_axes(description, tmp_path) as (folder, rings):
+            rings[0].page.put(PageField.START_NS, 1)
+            server._feeds._looked_s = float("-inf")
+            server._show(0)
+            assert {*server._channels} >= {"/x/scope", "/y/scope", "/y/events", "/diagnostics"}
+            hardware = [topics.diagnostics(0) for topics in server._topics]
+            named = [json.loads(each.data)["status"][0]["hardware_id"] for each in hardware]
+            assert named == [f"{folder.card.name} {axis}" for axis in "xy"]
     finally:
         server.run(lambda _: True)
 

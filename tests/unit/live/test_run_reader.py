@@ -7,10 +7,17 @@ from types import SimpleNamespace
 import numpy as np
 import pytest
 
-from hilctl.base.errors import RunError
+from hilctl.base.errors import InputError, RunError
 from hilctl.base.events import Event
 from hilctl.base.segments import Segment
-from hilctl.live.run_reader import RunList, RunReader, frame_of, frames_of, nearest_window_s
+from hilctl.live.run_reader import (
+    RunList,
+    RunReader,
+    frame_of,
+    frames_of,
+    nearest_window_s,
+    path_of,
+)
 from hilctl.live.scope import ROW, SIGNALS, Buckets, Scope, ScopeWindow
 from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run.metadata import RunDescription
@@ -21,6 +28,7 @@ from tests.fakes import SteppingClock
 from tests.unit.live.conftest import (
     BLOCK,
     CONFIGS,
+    active_axes,
     active_run,
     begun,
     exchange,
@@ -188,7 +196,9 @@ def decoded(frame):
     values = np.frombuffer(frame, "<f4", offset=4 + size)
     n, rows = header["n"], header["signals"] * header["n"]
     low, high = values[n : n + rows], values[n + rows : n + 2 * rows]
-    loops = values[n + 2 * rows :].reshape(2, header["loop"])
+    end = n + 2 * rows
+    loops = values[end : end + 2 * header["loop"]].reshape(2, header["loop"])
+    assert values.size == end + loops.size + 4 * header["path"]
     return header, values[:n], low.reshape(-1, n), high.reshape(-1, n), loops
 
 
@@ -255,3 +265,60 @@ def test_frames_keep_their_interval_until_the_run_ends(feed):
     assert {*feed.windows} == {0.5}
     assert frames[0].low["displacement"].tolist() == [3.0, 4.0, 5.0]
     assert frames[0].high["displacement"].tolist() == [4.0, 5.0, 6.0]
+
+
+def test_a_reader_has_the_samples_of_its_axis_and_the_state_of_the_run(description, tmp_path):
+    with active_axes(description, tmp_path) as (folder, (x, y)):
+        feed = RunReader(folder, "y")
+        y.page.put(PageField.TUNE_NUMBER, 1)
+        y.page.put_float(PageField.TUNE_GAIN, 0.5)
+        y.page.push_event(Event(7, "info", "tuned", "of y"))
+        x.page.put(PageField.LATE_TICKS, 3)
+        x.page.put(PageField.START_NS, 12)
+        exchange(y, range(4), spike_um=5.0)
+        feed.poll(1.0)
+        status = feed.status()
+        assert (status["axis"], status["axes"]) == ("y", ["x", "y"])
+        assert status["recording"] == str(tmp_path / "a.y.mcap")
+        assert (status["gain"], status["late_ticks"], feed.start_ns) == (0.5, 3, 12)
+        assert [event.text for event in feed.events] == ["of y"]
+        assert status["t_s"] == pytest.approx(200 / 50e3)
+        assert RunReader(folder).axis == "x"
+        with pytest.raises(InputError, match=r"'z'.*x, y"):
+            RunReader(folder, "z")
+
+
+def test_a_list_has_a_reader_per_axis(description, tmp_path):
+    feeds = RunList(first)
+    with active_axes(description, tmp_path) as (folder, _):
+        feeds.update(0.0)
+        assert [each.axis for each in feeds.axes(None)] == ["x", "y"]
+        assert [*feeds] == feeds.axes(folder.card.name)
+        wanted = [feeds.feed(None, axis).axis for axis in ("y", "x", "z", None)]
+        assert wanted == ["y", "x", "x", "x"]
+
+
+def test_a_path_is_of_the_same_samples(description, tmp_path):
+    with active_axes(description, tmp_path, 512) as (folder, rings):
+        feeds = [RunReader(folder, axis) for axis in "xy"]
+        for ring, feed, blocks in zip(rings, feeds, (400, 380), strict=True):
+            exchange(ring, range(blocks))
+            feed.poll(1.0)
+        path = path_of([each.scope for each in feeds], 0.5)
+        assert np.array_equal(path[:2], path[2:], equal_nan=True)
+        newest = path[:, ~np.isnan(path[0])]
+        assert 380 * 50 - 20 < newest[0, -1] <= 380 * 50
+        assert set(np.diff(newest[0])) == {9.0}  # 0.1 s in 600 buckets
+        header, *_ = decoded(frame_of(feeds[0].scope, "roll", 0.5, path))
+        assert header["path"] == path.shape[1]
+
+
+def test_peak_error_is_that_since_the_last_reset(run):
+    feed, ring = run
+    exchange(ring, range(4), spike_um=5.0)
+    feed.poll(1.0)
+    assert feed.status()["peak_error"] == {"um": 5.0, "since_s": 0.0}
+    feed.reset_peak()
+    exchange(ring, range(4, 6), spike_um=-2.0)
+    feed.poll(2.0)
+    assert feed.status()["peak_error"] == {"um": 2.0, "since_s": 200 / 50e3}

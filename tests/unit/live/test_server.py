@@ -542,7 +542,8 @@ def status_at(description, run, *others, state="running", **more):
     return {"status": {
         "run": run, "runs": active, "state": state, "segment": "", "recording": "a.mcap",
         "disk": None, "ring_used": 0.0, "missed_samples": 0, "gain": 1.0, "offset": 0.0,
-        "inverse": "in", "description": description.model_dump(mode="json"), **lists, **values,
+        "inverse": "in", "axis": "", "axes": [], "peak_error": {"um": None, "since_s": 0.0},
+        "description": description.model_dump(mode="json"), **lists, **values,
     }}  # fmt: skip
 
 
@@ -689,3 +690,26 @@ def test_stop_without_a_supervisor_is_refused_with_its_reason(description, tmp_p
         answer = asyncio.run(pressed())
     assert not answer["ok"]
     assert "supervisor" in answer["error"]
+
+
+def test_page_of_several_axes_shows_a_path_and_changes_the_axis_shown(description):
+    x, y = (
+        status_at(description, "stage-1", axis=axis, axes=["x", "y", "z"]) for axis in ("x", "y")
+    )
+    clicks = [{"click": "inverse-out"}, y, {"click": "inverse-out"}, {"click": "reset"}]
+    _, sent = page_after(x, *clicks)
+    views = [each["view"] for each in sent if each["ask"] == "view"]
+    assert (views[-1]["across"], views[-1]["up"]) == ("x", "y")
+    requests = [each["request"] for each in sent if each["ask"] == "run"]
+    assert [each["axes"] for each in requests] == [
+        {"x": {"inverse": "out"}},
+        {"y": {"inverse": "out"}},
+    ]
+    assert sent[-1]["ask"] == "reset"
+
+
+def test_page_of_one_axis_has_no_path_and_names_no_axis(description):
+    _, sent = page_after(status_at(description, "sine-1"), {"click": "inverse-out"})
+    assert {each["view"]["across"] for each in sent if each["ask"] == "view"} == {""}
+    (request,) = (each["request"] for each in sent if each["ask"] == "run")
+    assert "axes" not in request
