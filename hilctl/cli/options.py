@@ -6,10 +6,13 @@ one. Their imports are local, because a command needs them for completion only.
 
 import json
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Annotated, Any
 
 import typer
+
+from hilctl.base.errors import HilctlError
 
 
 def device_names() -> list[str]:
@@ -48,13 +51,28 @@ def recording_paths() -> list[str]:
     return sorted(map(str, found))
 
 
-def experiment_keys() -> list[tuple[str, str]]:
-    """Return the dotted keys of experiments, followed by ``=``."""
+def experiment_keys(ctx: typer.Context) -> list[tuple[str, str]]:
+    """Return the dotted keys of experiments, followed by ``=``, and those of the file's axes."""
     from hilctl.experiment.examples import schema_file
 
     schema = json.loads(schema_file().read_text(encoding="utf-8"))
     found = dict(_keys(schema["else"], schema["$defs"]))
-    return [(f"{key}=", meaning) for key, meaning in found.items()]
+    of_axes = schema["$defs"]["Experiment_of_axes"]["properties"]["axes"]
+    # The parser keeps the argument, because the option to be completed has no value yet.
+    for name in _axes_of(Path(ctx.args[0])) if ctx.args else ():
+        found |= _keys(of_axes["additionalProperties"], schema["$defs"], f"axes.{name}")
+        found[f"axis={name}"] = "this axis alone"
+    return [(key if "=" in key else f"{key}=", meaning) for key, meaning in found.items()]
+
+
+def _axes_of(experiment: Path) -> list[str]:
+    """Return the names of the axes of an experiment; none if it cannot be read."""
+    from hilctl.base.yaml import Document
+
+    with suppress(HilctlError, OSError, UnicodeError):
+        axes = Document(str(experiment), experiment.read_text("utf-8")).data.get("axes")
+        return [*axes] if isinstance(axes, dict) else []
+    return []
 
 
 def _keys(node: dict[str, Any], definitions: dict[str, Any], at: str = "") -> Iterator[Any]:

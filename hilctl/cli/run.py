@@ -300,10 +300,14 @@ def _axis_rows(result: RunResult, reports: Sequence[RunReport]) -> Iterator[tupl
 
 
 def print_forecast(checked: CheckedRun) -> None:
-    """Print the forecast of each axis of a run, and its warnings."""
-    terminal = console()
-    for name, axis in zip(checked.names, checked.axes, strict=True):
-        terminal.print(listing(name and f"Axis {name}", _forecast_rows(axis).items()))
+    """Print what the axes of a run have in common, then the rest and the warnings of each."""
+    terminal, rows = console(), [_forecast_rows(axis) for axis in checked.axes]
+    common = dict(set.intersection(*(set(each.items()) for each in rows)))
+    terminal.print(listing("", ((key, common[key]) for key in rows[0] if key in common)))
+    for name, axis, own in zip(checked.names, checked.axes, rows, strict=True):
+        if name:
+            left = [(key, text) for key, text in own.items() if key not in common]
+            terminal.print(listing(f"Axis {name}", left))
         for warning in axis.warnings:
             terminal.print(f"warning: {warning}", style="yellow")
     for note in checked.notes:
@@ -328,7 +332,7 @@ def _forecast_rows(checked: CheckedExperiment) -> dict[str, str]:
         "reference": f"{reference} {unit_text(checked.reference.unit)}",
         "command": f"{command} (limits {low:g} to {high:g})",
         "slew": f"{forecast.slew_per_s:.4g} {unit}/s (limit {limits.slew_per_s:g})",
-        "recording": _recording(forecast.recording_mb),
+        "recording": _recording(forecast.recording_mb) + " per axis" * bool(checked.loaded.axis),
     }
     if config.amplifier is not None and forecast.voltage_v is not None:
         rows["voltage"] = f"{forecast.voltage_v:.4g} V (limit {config.amplifier.voltage_max_v:g})"

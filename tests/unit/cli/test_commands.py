@@ -84,12 +84,15 @@ def completing(words):
     ("run x.yaml --set waveform.freq", {"waveform.frequency_hz="}),
     ("check x.yaml --set device.h", {"device.host="}),
     ("sweep x.yaml --vary samp", {"sample_rate_hz="}),
+    ("run xy.yaml --set axis", {"axis=x", "axis=y"}),
+    ("run xy.yaml --set block=5 --set axes.y.waveform.ph", {"axes.y.waveform.phase_deg="}),
 ])  # fmt: skip
 def test_shell_completes_options_and_values(words, some, tmp_path, monkeypatch, hilctl):
     monkeypatch.chdir(tmp_path)
     day = tmp_path / "recordings" / "day"
     day.mkdir(parents=True)
     (day / "a.mcap").touch()
+    (tmp_path / "xy.yaml").write_text("axes: {x: {}, y: {}}", encoding="utf-8")
     load(words.split(" ")[0])  # it must not import the fake run for all later tests
     card = SimpleNamespace(name="rig-1", experiment="rig.yaml")
     monkeypatch.setattr("hilctl.run.run_folder.runs", lambda: [SimpleNamespace(card=card)])

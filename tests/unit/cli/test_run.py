@@ -18,9 +18,10 @@ from hilctl.base.segments import Segment
 from hilctl.cli import run as module
 from hilctl.cli.output import Verbosity
 from hilctl.cli.reports import render_report
-from hilctl.cli.run import print_run, run_progress
+from hilctl.cli.run import print_forecast, print_run, run_progress
 from hilctl.run.result import RunResult
 from hilctl.run.safety.manual_safe import SafeResult
+from hilctl.run.start import checked_run
 
 DEMO = Path(__file__).parents[3] / "configs" / "demo.yaml"
 ENDED = RunResult(Path("a.mcap"), "stopped", "hilctl stop", "confirmed", 15, 0, 3, 2)
@@ -219,3 +220,12 @@ def test_segments_have_a_table_without_empty_columns(make_recording):
     for shown in ("first", "second", "peak hyst. %"):
         assert shown in text
     assert "err. %" not in text
+
+
+def test_a_forecast_has_common_rows_once(capsys):
+    stage = Path(__file__).parents[3] / "configs" / "stage_xy.yaml"
+    print_forecast(checked_run(stage, ["axes.x.waveform.amplitude=20"]))
+    rows = [line.split("  ")[0] for line in capsys.readouterr().out.splitlines()]
+    counts = [rows.count(row) for row in ("duration", "recording", "command", "Axis x", "Axis y")]
+    assert counts == [1, 1, 2, 1, 1]
+    assert rows.index("duration") < rows.index("Axis x")
