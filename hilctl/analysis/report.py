@@ -151,6 +151,8 @@ class RunReportBuilder:
             lateness_us=tick_lateness.percentiles_us(ticks.late_ns),
             lateness_by_minute=ticks.by_minute(),
             exchange_us=tick_lateness.percentiles_us(ticks.exchange_ns),
+            busy_us=tick_lateness.percentiles_us(ticks.busy_ns),
+            period_us=None if ticks.period_ns is None else ticks.period_ns * 1e-3,
             processes=processes_of(last),
             adapted=dict(adapted[-1]) if adapted else {},
             lost_readings=round(sum(lost)),

@@ -113,6 +113,9 @@ class RunReport(RunMetrics):
             empty without ticks.
         lateness_by_minute: The same percentiles per minute, with ``minute`` from 0 and ``ticks``.
         exchange_us: The same percentiles of the duration of exchanges with the device.
+        busy_us: The same percentiles of the time from the deadline of a tick to the end of its
+            exchange; the rest of its period is left.
+        period_us: Time from one tick to the next; None without two ticks.
         adapted: Final parameters of the adaptation, see :data:`hilctl.base.events.ADAPTED`; empty
             without adaptation.
         processes: Resource usage of ``loop`` and ``supervisor``; empty if not recorded.
@@ -152,6 +155,8 @@ class RunReport(RunMetrics):
     lateness_us: dict[str, float]
     lateness_by_minute: list[dict[str, float]]
     exchange_us: dict[str, float]
+    busy_us: dict[str, float]
+    period_us: float | None
     adapted: dict[str, float]
     processes: dict[str, ProcessUsage]
     marks: tuple[tuple[float, str], ...]
@@ -202,6 +207,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         *(("mark", f"{at_s:.6g} s: {printable(text)}") for at_s, text in report.marks),
         ("lateness", _percentiles(report.lateness_us)),
         ("exchange", _percentiles(report.exchange_us)),
+        ("busy", _busy(report.busy_us, report.period_us)),
         *((f"{name} process", usage_text(each)) for name, each in report.processes.items()),
     ]
 
@@ -273,6 +279,11 @@ def _range(low: float | None, high: float | None, unit: str) -> str:
 
 def _count(value: int | None) -> str:
     return MISSING if value is None else f"{value:,}"
+
+
+def _busy(figures: dict[str, float], period_us: float | None) -> str:
+    text = _percentiles(figures)
+    return text if text == MISSING else f"{text}, of {quantity(period_us, 'us')} per tick"
 
 
 def _percentiles(figures: dict[str, float]) -> str:

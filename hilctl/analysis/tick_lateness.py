@@ -54,12 +54,17 @@ _PERCENTILES = {"p50": 50.0, "p90": 90.0, "p99": 99.0, "p99.9": 99.9}
 class LatenessBuilder:
     """Lateness of the ticks of a run so far, and the durations of their exchanges.
 
+    A tick waits for its deadline, wakes up and computes (``late_ns``, from the deadline to the
+    exchange), and exchanges its block (``exchange_ns``); ``busy_ns`` is the sum of both.
+
     ``minutes`` is the planned duration of the run; beyond a day, several minutes share a row.
     """
 
     def __init__(self, minutes: float) -> None:
         self._together = 1 + int(minutes) // MOST_ROWS
-        self.late_ns, self.exchange_ns = Quantiles(), Quantiles()
+        self.late_ns, self.exchange_ns, self.busy_ns = Quantiles(), Quantiles(), Quantiles()
+        self.period_ns: float | None = None
+        """Median time from one deadline to the next; None before the second tick."""
         self._rows: list[dict[str, float]] = []
         self._minute, self._of_minute = 0, Quantiles()
 
@@ -69,6 +74,9 @@ class LatenessBuilder:
             return
         self.late_ns.add(ticks.late_ns)
         self.exchange_ns.add(ticks.exchange_ns)
+        self.busy_ns.add(ticks.late_ns + ticks.exchange_ns)
+        if self.period_ns is None and ticks.deadline_ns.size > 1:
+            self.period_ns = float(np.median(np.diff(ticks.deadline_ns)))
         minutes = ticks.deadline_ns // _MINUTE_NS // self._together * self._together
         cuts = np.flatnonzero(np.diff(minutes)) + 1
         parts = np.split(ticks.late_ns, cuts)

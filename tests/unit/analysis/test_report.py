@@ -342,6 +342,8 @@ class TestWholeRun:
             summarize(replace(told, run={**told.run, "max_missed_share": "x"}))
         assert counted.lateness_us["max"] == pytest.approx(700.0)
         assert counted.exchange_us["p50"] == pytest.approx(30.0)
+        assert counted.busy_us["max"] == pytest.approx(730.0)
+        assert counted.period_us == pytest.approx(1000.0)
 
     def test_counter_that_is_no_number_is_refused(self, lagging) -> None:
         with pytest.raises(DataError, match=r"late_ticks .* 'many'"):
