@@ -15,6 +15,7 @@ from typing import TYPE_CHECKING, Any, Self
 import numpy as np
 
 from hilctl import __version__
+from hilctl.base.axes import RUN_KEYS
 from hilctl.base.device import AuxChannel, DeviceInfo
 from hilctl.base.errors import RunError
 from hilctl.base.events import CHANGES, Event
@@ -226,8 +227,6 @@ class RunDescription(StrictModel):
     @classmethod
     def of(cls, checked: "CheckedExperiment") -> Self:
         """Return the description of a checked experiment."""
-        from hilctl.experiment.file import RUN_KEYS  # pydantic models of all sections
-
         loaded, reference = checked.loaded, checked.reference
         config, info = loaded.config, loaded.device.info
         data = loaded.document.data

@@ -14,7 +14,7 @@ import os
 import socketserver
 import threading
 import time
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from contextlib import suppress
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
@@ -175,8 +175,7 @@ _WAIT_S = 20.0  # longest wait for the previous change; a client waits longer fo
 _POLL_S = 0.005
 _LEAD_S = 0.05  # time from the answer to the first sample of a change
 _ROUNDING = 1e-9  # relative; a run at its slew limit still accepts an offset
-_COUPLING = "coupling"  # key of an experiment whose axes are decoupled before the run
-_TOGETHER = "the axes are decoupled for equal changes: change all of them, without a name"
+_TOGETHER = "coupling: the axes are decoupled for equal changes: change all of them, without a name"
 _ONE_AXIS = "the run has one axis: change it without the name {!r}"
 _CYCLE = 2000  # samples per cycle of the sine from which the command range is computed
 
@@ -220,9 +219,12 @@ class Changes:
         self._lock = threading.Lock()
         self._places = threading.BoundedSemaphore(_MOST_WAITING)
 
-    def references(self) -> dict[str, Any]:
-        """Return the final values of the only axis, or those of all axes under ``references``."""
-        values = {name: asdict(state) for name, state in self._states.items()}
+    def references(self, axes: Iterable[str] | None = None) -> dict[str, Any]:
+        """Return the final values of the only axis, or those of axes under ``references``.
+
+        ``axes`` None is all.
+        """
+        values = {name: asdict(self._states[name]) for name in axes or self._states}
         return values.get("", {"references": values})
 
     def make(self, wanted: "SetRequest") -> dict[str, Any]:
@@ -260,8 +262,8 @@ class Changes:
         if unknown := [name for name in wanted.axes if name not in names]:
             known = f"no axis is named {unknown[0]!r} ({did_you_mean(unknown[0], names)})"
             raise InputError(f"set: {known if names[0] else _ONE_AXIS.format(unknown[0])}")
-        if wanted.axes and _COUPLING in self._run.first.loaded.document.data:
-            raise InputError(f"set: {_COUPLING}: {_TOGETHER}")
+        if wanted.axes and self._run.coupled:
+            raise InputError(f"set: {_TOGETHER}")
         common = wanted.model_dump(include={*ReferenceChange.model_fields}, exclude_none=True)
         own = {name: each.model_dump(exclude_none=True) for name, each in wanted.axes.items()}
         changes = {name: common | own.get(name, {}) for name in names}
@@ -302,7 +304,7 @@ class Changes:
         # Last, and once for all axes: the loop reads the numbers above when the count changes.
         page.publish(PageField.TUNE_WANTED, number)
         self._states |= states
-        return {**self.references(), "over_s": over_s, "begins_at_sample": begins_at}
+        return {**self.references(states), "over_s": over_s, "begins_at_sample": begins_at}
 
     def _bound_refusal(self, name: str, state: ReferenceState) -> str:
         """Return why the reference of an axis cannot change to a state, or an empty text."""

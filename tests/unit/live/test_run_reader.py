@@ -23,7 +23,7 @@ from hilctl.loop.safe_output import LoopOutcome
 from hilctl.run.metadata import RunDescription
 from hilctl.run.run_folder import run_folder
 from hilctl.run.shared.shared_page import PageField, Stop
-from hilctl.run.start import checked_experiment
+from hilctl.run.start import checked_experiment, checked_run
 from tests.fakes import SteppingClock
 from tests.unit.live.conftest import (
     BLOCK,
@@ -286,6 +286,15 @@ def test_a_reader_has_the_samples_of_its_axis_and_the_state_of_the_run(descripti
         assert RunReader(folder).axis == "x"
         with pytest.raises(InputError, match=r"'z'.*x, y"):
             RunReader(folder, "z")
+
+
+def test_keys_of_an_axis_are_those_that_set_it():
+    run = checked_run(CONFIGS / "stage_xy.yaml", ["axes.y.waveform.amplitude=20"])
+    rows = {row.key: row.value for row in RunDescription.of(run.axes[1]).settings}
+    assert rows["sample_rate_hz"] == "50000"
+    assert rows["axes.y.waveform.amplitude"] == "20"
+    assert rows["axes.y.device.seed"] == "2"
+    assert not {"device.seed", "axes.y.sample_rate_hz"} & rows.keys()
 
 
 def test_a_list_has_a_reader_per_axis(description, tmp_path):

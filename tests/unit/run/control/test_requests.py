@@ -365,7 +365,7 @@ def test_axes_change_together_by_one_count(axes, page):
     assert [each.get(PageField.TUNE_NUMBER) for each in pages] == [1, 1]
     assert [each.get(PageField.TUNE_WANTED) for each in pages] == [1, 0]
     take(page, 2000)
-    change_axes(changes, axes={"y": {"gain": 1.0}})
+    assert {*change_axes(changes, axes={"y": {"gain": 1.0}})["references"]} == {"y"}
     assert [each.get(PageField.TUNE_NUMBER) for each in pages] == [1, 2]
     assert page.get(PageField.TUNE_WANTED) == 2
     assert changes.references()["references"]["x"]["gain"] == 0.5
@@ -394,7 +394,7 @@ def test_a_run_of_one_axis_has_no_name(changes):
 
 def test_coupled_axes_change_together_only(experiment, page):
     run, pages = axes_of(experiment, experiment), [page, SharedPage(mmap(-1, SIZE))]
-    coupled = replace(run.first.loaded, document=Document("x.yaml", "coupling: a.yaml"))
+    coupled = replace(run.first.loaded, coupling=Mock())
     run = replace(run, axes=(replace(run.first, loaded=coupled), *run.axes[1:]))
     changes = Changes(run, pages)
     with pytest.raises(InputError, match="set: coupling: "):
