@@ -168,8 +168,8 @@ class View:
             self.feed = self._feeds[(shown + 1) % len(self._feeds)]
 
     def _change(self, what: str, **values: object) -> None:
-        """Request a change of the axis that is shown."""
-        if axis := self.feed.axis:
+        """Request a change of the axis that is shown, or of all if they are coupled."""
+        if (axis := self.feed.axis) and not self.feed.description.coupled:
             what, values = f"{axis}: {what}", {"axes": {axis: values}}
         self._ask(what, set_run, **values, over_s=_OVER_S)
 

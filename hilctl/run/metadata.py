@@ -218,6 +218,7 @@ class RunDescription(StrictModel):
     measures_command: bool
     waveform_unit: str
     compensator: str
+    coupled: bool  # whether only all axes can be changed, because each depends on all references
     samples: int
     segments: list[Segment]  # from the waveform's first sample
     limits: LimitBounds
@@ -245,6 +246,7 @@ class RunDescription(StrictModel):
             measures_command=info.measures_command,
             waveform_unit=reference.unit,
             compensator=str(getattr(loaded.model, "kind", "")),
+            coupled=loaded.coupling is not None,
             samples=int(reference.values.size),
             segments=list(reference.segments),
             limits=_limits(checked),

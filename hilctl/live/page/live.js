@@ -222,7 +222,8 @@ function showAxes() {
     button.addEventListener("click", () => { view.axis = name; ask("view", { view }); });
     return button;
   }));
-  $("path").hidden = $("all-axes").hidden = axes.length === 0;
+  $("path").hidden = axes.length === 0;
+  $("all-axes").hidden = !choosesAxis();
   if (axes.length ? axes.includes(view.across) && axes.includes(view.up) : !view.across) return;
   [view.across, view.up] = axes.length ? axes : ["", ""];
   for (const end of ["across", "up"]) $(`path-${end}`).replaceChildren(...axes.map((name) => new Option(name, name, false, name === view[end])));
@@ -863,9 +864,14 @@ function request(command, what) {
   });
 }
 
+// Whether the axis that is shown can be changed alone.
+function choosesAxis() {
+  return Boolean(status.axis) && !status.description.coupled;
+}
+
 // A change of the axis that is shown, or of all axes.
 function change(values, what) {
-  const own = status.axis && !$("all").checked;
+  const own = choosesAxis() && !$("all").checked;
   request({ command: "set", ...(own ? { axes: { [status.axis]: values } } : values), over_s: typed("over") }, own ? `${status.axis}: ${what}` : what);
 }
 

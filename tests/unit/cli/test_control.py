@@ -73,6 +73,23 @@ def test_status_of_several_runs_has_their_errors(shown):
     ]
 
 
+def test_axes_have_lines_of_their_own(shown, capsys):
+    values = {"gain": 0.5, "offset": 0.0, "inverse": "in"}
+    references = {"x": values, "y": {**values, "inverse": None}}
+    answer = {"references": references, "over_s": 1.0}
+    print_change("stage-7", answer)
+    assert capsys.readouterr().out.splitlines() == [
+        "stage-7 x: gain 0.5, offset 0, inverse in, over 1 s",
+        "stage-7 y: gain 0.5, offset 0, over 1 s",
+    ]
+    lines = [line.split()[:2] for line in shown({**RUNNING, "references": references})]
+    assert [line for line in lines if line[0] in {"reference", "inverse"}] == [
+        ["reference", "x"],
+        ["inverse", "x"],
+        ["reference", "y"],
+    ]
+
+
 @pytest.mark.parametrize(("inverse", "said"), [(None, ""), ("out", ", inverse out")])
 def test_change_is_one_line(capsys, inverse, said):
     print_change("sine-7", {"gain": 0.5, "offset": -2.0, "inverse": inverse, "over_s": 1.5})

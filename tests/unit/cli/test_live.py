@@ -26,7 +26,9 @@ class FakeFeed:
         self.folder, self.inverse, self.loop_input = "folder", inverse, "reference"
         self.axis = axis
         self.state, self.ended, self._polls = "running", False, polls
-        self.description = SimpleNamespace(command_unit="A", sample_rate_hz=1000.0)
+        self.description = SimpleNamespace(
+            command_unit="A", sample_rate_hz=1000.0, coupled=axis == "coupled"
+        )
         self.events = [Event(1000 * k, "info", "mark", f"tap {k}") for k in range(5)]
         self.values = {
             "run": "demo-7", "state": "running", "reason": "", "t_s": 12.34, "total_s": 30.0,
@@ -93,6 +95,8 @@ def test_keys_change_the_axis_shown(sent, capsys):
     view.press(b"+a-a")
     assert [each["axes"] for each in sent] == [{"x": {"gain": 0.8}}, {"y": {"gain": 0.6}}]
     assert view.feed.axis == "x"
+    View(FakeFeed(axis="coupled")).press(b"+")
+    assert sent[2:] == [{"gain": 0.8, "over_s": 0.5}]
     assert "a axis" in shown(view, capsys)
 
 

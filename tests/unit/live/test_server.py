@@ -708,6 +708,14 @@ def test_page_of_several_axes_shows_a_path_and_changes_the_axis_shown(descriptio
     assert sent[-1]["ask"] == "reset"
 
 
+def test_page_of_coupled_axes_changes_all(description):
+    coupled = description.model_copy(update={"coupled": True})
+    status = status_at(coupled, "stage-1", axis="x", axes=["x", "y"])
+    _, sent = page_after(status, {"click": "inverse-out"})
+    (request,) = (each["request"] for each in sent if each["ask"] == "run")
+    assert "axes" not in request
+
+
 def test_page_of_one_axis_has_no_path_and_names_no_axis(description):
     _, sent = page_after(status_at(description, "sine-1"), {"click": "inverse-out"})
     assert {each["view"]["across"] for each in sent if each["ask"] == "view"} == {""}
