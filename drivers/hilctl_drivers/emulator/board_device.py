@@ -14,6 +14,7 @@ from hilctl_drivers.emulator.rig import Bench, SampleFifo
 from hilctl_drivers.emulator.wire import EmulatedReply, RejectedRequest, SerialDevice
 
 _GOOD = b"\0"
+_WRITING = {bytes([each]) for each in (board.EXCHANGE, board.STREAM, board.SAFE)}
 
 
 class EmulatedBoard(SerialDevice):
@@ -80,6 +81,10 @@ class EmulatedBoard(SerialDevice):
         """Return a reply that refuses the message."""
         kind, seq = (*message[:2], 0, 0)[:2]
         return EmulatedReply(board.REPLY_HEAD.pack(kind | board.REPLY_BIT, seq, status))
+
+    def written(self, message: bytes) -> set[str]:
+        """Return its output for the messages that write it."""
+        return {self._name} if message[:1] in _WRITING else set()
 
     def wrong_id(self, reply: bytes) -> bytes:
         """Return a reply with the number of another message."""

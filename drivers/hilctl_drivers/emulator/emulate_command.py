@@ -32,7 +32,7 @@ from hilctl_drivers.emulator.options import (
 )
 from hilctl_drivers.emulator.rig import ACTUATORS
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
-from hilctl_drivers.profile import NamedProfile, shipped_profiles
+from hilctl_drivers.profile import NamedProfile, load_profile, shipped_profiles
 from hilctl_drivers.signal_chain import AddressOptions, DacOptions
 from hilctl_drivers.simulated.simulated_device import SimulatedOptions
 
@@ -102,7 +102,7 @@ def wired_experiment(
         problems[name] = ()
         try:
             options = _device_options(document, path.parent, files)
-            rig = _rig_options(document, options, simulated[name], number)
+            rig = _rig_options(name, document, options, simulated[name], number)
         except ConfigError as error:
             problems[name] = error.problems
             continue
@@ -149,7 +149,7 @@ def _place(options: DacOptions) -> tuple[Any, ...]:
 
 
 def _rig_options(
-    document: Document, options: DacOptions, simulated: Document, number: int
+    axis: str, document: Document, options: DacOptions, simulated: Document, number: int
 ) -> RigOptions:
     unit = "A" if options.amplifier is None else options.amplifier.command_unit
     actuator = _actuator(unit, simulated, document.data.get("amplifier"))
@@ -160,6 +160,7 @@ def _rig_options(
         actuator=actuator.model_copy(update={"seed": actuator.seed + number}),
         wiring=(options.amplifier, options.sensor),
         limits=limited_range(document.data.get("limits")),
+        axis=axis,
     )
 
 
@@ -284,9 +285,10 @@ def emulate(
     fault: Annotated[
         list[str] | None,
         typer.Option(
-            metavar="KIND@WHEN",
+            metavar="[OUTPUT:]KIND@WHEN",
             help="Fault at request KIND@COUNT or time KIND@SECONDSs; may be repeated. Kinds: "
-            f"{', '.join(KINDS)}. {', '.join(LASTING)} take a duration: delay:0.3@500.",
+            f"{', '.join(KINDS)}. {', '.join(LASTING)} take a duration: delay:0.3@500. OUTPUT, or "
+            "an axis, has the fault from then on.",
         ),
     ] = None,
     output: Annotated[str | None, typer.Option(help="Output that drives the rig.")] = None,
@@ -350,6 +352,11 @@ def emulate(
         rigs = (RigOptions(output, sensor, simulated),)
         devices = (EmulatorOptions(profile, host=host, port=port, rigs=rigs, **own),)
     faults = tuple(parse_fault(text) for text in fault or ())
+    known = {rig.axis for each in devices for rig in each.rigs} - {""}
+    known |= {name for each in devices for name in load_profile(each.profile).outputs}
+    for each in faults:
+        if each.output and each.output not in known:
+            raise InputError(f"fault of {each.output}: must be of {', '.join(sorted(known))}")
     first = replace(devices[0], reader_port=reader_port or devices[0].reader_port)
     options = [
         replace(each, log=log, faults=faults, command=command) for each in (first, *devices[1:])

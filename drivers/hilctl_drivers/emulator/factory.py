@@ -180,7 +180,10 @@ class _Plan:
 
     def rigs(self, now_ns: int) -> tuple[WiredRig, ...]:
         """Return the rigs, at rest."""
-        return tuple(WiredRig(Rig(now_ns, actuator), wiring) for actuator, wiring in self._rigs)
+        return tuple(
+            WiredRig(Rig(now_ns, actuator), wiring, each.axis)
+            for each, (actuator, wiring) in zip(self._options.rigs, self._rigs, strict=True)
+        )
 
     def devices(
         self, rigs: Sequence[WiredRig], log: WriteLog

@@ -144,6 +144,14 @@ class EmulatedModbus(EmulatedDevice):
         self._measure()
         return self.memory.read(areas, address, count)
 
+    def written(self, area: str, address: int, count: int) -> set[str]:
+        """Return the outputs with a register among those of a write."""
+        outputs = self.profile.outputs.items()
+        found = {name: (each.area, self.profile.wire_address(each)) for name, each in outputs}
+        return {
+            name for name, (of, at) in found.items() if of == area and 0 <= at - address < count
+        }
+
     def write(self, area: str, address: int, data: bytes) -> None:
         """Write all register words, or raise RejectedRequest and write none."""
         if self.overlay is not None and self.overlay.has(address):

@@ -7,6 +7,7 @@ cannot inject faults into replies.
 
 import struct
 from collections.abc import Coroutine, Iterator, Mapping, Sequence
+from contextlib import suppress
 from typing import Any, Literal
 
 from pymodbus.constants import ExcCodes
@@ -29,6 +30,29 @@ _AREAS: dict[int, tuple[str, ...]] = {
 }
 
 
+def _feedback_frames(data: bytes) -> Iterator[tuple[int, int, int, bytes]]:
+    """Yield whether a frame writes, its address, number of registers, and data."""
+    while data:
+        write, address, count = struct.unpack_from(">BHB", data)
+        size = 4 + 2 * count * write
+        yield write, address, count, data[4:size]
+        data = data[size:]
+
+
+def _writes(pdu: bytes) -> Iterator[tuple[str, int, int]]:
+    """Yield area, address and number of the registers that a message writes."""
+    function = pdu[0]
+    if function in {5, 6}:
+        yield "coil" if function == 5 else "holding", int.from_bytes(pdu[1:3], "big"), 1
+    elif function in {15, 16, 23}:
+        address, count = struct.unpack_from(">HH", pdu, 5 if function == 23 else 1)
+        yield "coil" if function == 15 else "holding", address, count
+    elif function == 76:
+        for write, address, count, _ in _feedback_frames(pdu[1:]):
+            if write:
+                yield "holding", address, count
+
+
 class FeedbackPdu(ModbusPDU):
     """LabJack's Modbus Feedback, function 76: read and write frames in one message."""
 
@@ -49,11 +73,9 @@ class FeedbackPdu(ModbusPDU):
 
     async def datastore_update(self, context: Any, device_id: int) -> ModbusPDU:
         """Execute frame after frame, as LabJack's protocol page describes them."""
-        reply, rest = b"", self.data
+        reply = b""
         try:
-            while rest:
-                write, address, count = struct.unpack_from(">BHB", rest)
-                data, rest = rest[4 : 4 + 2 * count * write], rest[4 + 2 * count * write :]
+            for write, address, count, data in _feedback_frames(self.data):
                 if write > 1 or len(data) < 2 * count * write:
                     return ExceptionResponse(76, ExcCodes.ILLEGAL_VALUE)
                 if write:
@@ -135,9 +157,12 @@ class ModbusWire(EmulatedWire):
         """Execute a request."""
         return self._answered(self._reply(request, now_ns), request)
 
+    def _device(self, request: bytes) -> EmulatedModbus | None:
+        return self._units.get(min(self._units) if self._any_unit else request[2])
+
     def _reply(self, request: bytes, now_ns: int) -> ModbusPDU:
         unit, function = request[2], request[3]
-        device = self._units.get(min(self._units) if self._any_unit else unit)
+        device = self._device(request)
         if device is None:
             return ExceptionResponse(function, ExcCodes.GATEWAY_NO_RESPONSE)
         device.request(now_ns)
@@ -157,6 +182,17 @@ class ModbusWire(EmulatedWire):
     def refusal(self, request: bytes, code: int = ExcCodes.DEVICE_FAILURE) -> EmulatedReply:
         """Return an exception reply; by default, the code for a device failure."""
         return self._answered(ExceptionResponse(request[3], code), request)
+
+    def written(self, request: bytes) -> set[str]:
+        """See :meth:`~hilctl_drivers.emulator.wire.EmulatedWire.written`."""
+        device = self._device(request)
+        if device is None:
+            return set()
+        with suppress(struct.error):  # too short a message writes nothing
+            return device.names(
+                name for each in _writes(request[3:]) for name in device.written(*each)
+            )
+        return set()
 
     def corrupt_at(self, framed: bytes) -> int:
         """Return the byte of a reply whose damage must be detected."""

@@ -1,7 +1,7 @@
 """Options of an emulator, and the faults to inject."""
 
 import re
-from collections.abc import Sequence
+from collections.abc import Callable, Collection, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Literal, TypeAlias, cast, get_args
@@ -21,11 +21,12 @@ FaultKind: TypeAlias = Literal[
 KINDS: tuple[FaultKind, ...] = get_args(FaultKind)
 DELAY_S = 1.0
 LASTING = ("delay", "late", "invalid", "stall")
+_OF_DEVICE = ("reset", "unplug", "invalid", "stall")
 
 
 @dataclass(frozen=True, slots=True)
 class WireFault:
-    """One fault.
+    """One fault; of an output, it is permanent and concerns only the requests that write it.
 
     ``silence`` ignores the request; ``delay`` answers late; ``late`` executes it late, after other
     requests; ``exception`` refuses it; ``corrupt`` changes a byte of the reply; ``cut`` truncates
@@ -38,19 +39,26 @@ class WireFault:
     at_count: int | None = None  # transaction that has it, counted from 1
     at_s: float | None = None  # time since the start; the next transaction has it
     delay_s: float = DELAY_S  # of delay, late, invalid and stall
+    output: str = ""  # name of an output or of its axis
 
 
 def parse_fault(text: str) -> WireFault:
-    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; some kinds take ``:SECONDS`` before the @."""
-    found = re.fullmatch(r"([a-z_]+)(?::(\d+(?:\.\d+)?))?@(\d+(?:\.\d+)?)(s?)", text)
+    """Read ``KIND@COUNT`` or ``KIND@SECONDSs``; some kinds take ``:SECONDS`` before the @.
+
+    ``OUTPUT:`` before the kind makes it a fault of one output.
+    """
+    form = r"(?:(\w+):)?([a-z_]+)(?::(\d+(?:\.\d+)?))?@(\d+(?:\.\d+)?)(s?)"
+    found = re.fullmatch(form, text)
     if found is None:
         raise InputError(f"fault must be KIND@COUNT or KIND@SECONDSs, got {text!r}")
-    kind, delay, at, seconds = found.groups()
+    output, kind, delay, at, seconds = found.groups()
     if kind not in KINDS:
         raise InputError(f"fault must be one of {', '.join(KINDS)}, got {kind!r}")
     if delay is not None and kind not in LASTING:
         raise InputError(f"only {', '.join(LASTING)} take a time before the @, got {text!r}")
-    fault = WireFault(cast("FaultKind", kind), delay_s=float(delay or DELAY_S))
+    if output and kind in _OF_DEVICE:
+        raise InputError(f"{', '.join(_OF_DEVICE)} are faults of all outputs, got {text!r}")
+    fault = WireFault(cast("FaultKind", kind), delay_s=float(delay or DELAY_S), output=output or "")
     if seconds:
         return replace(fault, at_s=float(at))
     if "." in at or int(at) < 1:
@@ -59,20 +67,24 @@ def parse_fault(text: str) -> WireFault:
 
 
 class FaultPlan:
-    """The faults of each transaction; each happens once."""
+    """The faults of each transaction; each happens once, unless it is of one output."""
 
     def __init__(self, faults: Sequence[WireFault]) -> None:
         self._due = list(faults)
         self._count = 0
 
-    def next(self, elapsed_s: float) -> WireFault | None:
-        """Count a transaction, ``elapsed_s`` since the start; return its fault, if it has one."""
+    def next(self, elapsed_s: float, written: Callable[[], Collection[str]]) -> WireFault | None:
+        """Count a transaction, ``elapsed_s`` since the start; return its fault, if it has one.
+
+        ``written`` returns the names of the outputs that it writes.
+        """
         self._count += 1
         for fault in self._due:
             counted = fault.at_count is not None and self._count >= fault.at_count
             timed = fault.at_s is not None and elapsed_s >= fault.at_s
-            if counted or timed:
-                self._due.remove(fault)
+            if (counted or timed) and (not fault.output or fault.output in written()):
+                if not fault.output:
+                    self._due.remove(fault)
                 return fault
         return None
 
@@ -102,6 +114,7 @@ class RigOptions:
     # Amplifier and sensor; spread over the channels' ranges if None.
     wiring: tuple[Amplifier | None, Sensor] | None = None
     limits: tuple[float, float] | None = None  # of an experiment's drive, A or V
+    axis: str = ""  # its name
 
 
 @dataclass(frozen=True)

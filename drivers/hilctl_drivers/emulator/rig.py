@@ -2,7 +2,7 @@
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeAlias
@@ -163,11 +163,12 @@ class WiredRig:
 
     rig: Rig
     wiring: SimulatedWiring
+    axis: str = ""
 
-    @property
-    def logged_as(self) -> str:
-        """Name of its command in the log."""
-        return COLUMNS["command"].field(self.wiring.command_unit).name
+    def logged(self, command: float) -> dict[str, Any]:
+        """Return the fields of a command in the log."""
+        name = COLUMNS["command"].field(self.wiring.command_unit).name
+        return {name: command} | ({"axis": self.axis} if self.axis else {})
 
 
 @dataclass(frozen=True, slots=True)
@@ -210,6 +211,11 @@ class EmulatedDevice(ABC):
         """Whether the host watchdog has tripped."""
         return self._timer.tripped
 
+    def names(self, outputs: Iterable[str]) -> set[str]:
+        """Return the names of outputs, and those of their axes."""
+        found = {*outputs}
+        return found | {self._driven[each].axis for each in found & self._driven.keys()}
+
     def tick(self, now_ns: int) -> None:
         """Advance the time; the watchdog may trip meanwhile."""
         due_ns = self._timer.trip(now_ns)
@@ -236,11 +242,11 @@ class EmulatedDevice(ABC):
 
     def _set_terminal(self, name: str, value: float, event: str, now_ns: int) -> None:
         """Log an output's new value, and drive the rig if one is wired to it."""
-        more: dict[str, float] = {}
+        more: dict[str, Any] = {}
         if name in self._driven:
             driven = self._driven[name]
             driven.rig.put_out(driven.wiring.command(value), now_ns)
-            more[driven.logged_as] = driven.rig.command
+            more = driven.logged(driven.rig.command)
         unit = self.profile.outputs[name].unit
         self._log.event(now_ns, event, output=name, value=value, unit=unit, **more)
 
@@ -250,7 +256,7 @@ class EmulatedDevice(ABC):
         value, unit = driven.wiring.output(last), self.profile.outputs[name].unit
         self._log.event(
             now_ns, "played", output=name, first=first, samples=command.size,
-            value=value, unit=unit, **{driven.logged_as: last},
+            value=value, unit=unit, **driven.logged(last),
         )  # fmt: skip
         return value
 

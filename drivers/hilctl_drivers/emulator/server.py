@@ -276,7 +276,8 @@ class EmulatorServer:
         heapq.heapify(self._scheduled)
         fault = None
         if connection.faulty:
-            fault = self._plan.next((now_ns - self._start_ns) * 1e-9)
+            written = partial(connection.wire.written, request)
+            fault = self._plan.next((now_ns - self._start_ns) * 1e-9, written)
         if fault is not None and fault.kind == "invalid":
             for wire in self._wires:
                 wire.mark_invalid(now_ns + round(fault.delay_s * 1e9))

@@ -105,6 +105,15 @@ class EmulatedText(SerialDevice):
         """Return a reply; a prompt follows also if it is empty."""
         return EmulatedReply(text.encode() if text or self._prompts else None)
 
+    def written(self, message: bytes) -> set[str]:
+        """Return the outputs that a line writes."""
+        text, combined = message.decode("ascii", "replace"), self.profile.exchange
+        writes = {name: output.write for name, output in self.profile.outputs.items()}
+        found = {name for name, template in writes.items() if self._matches(template, text)}
+        if combined != "none" and self._matches(combined.write, text):
+            found.add(combined.output)
+        return found
+
     def wrong_id(self, reply: bytes) -> bytes:
         """Return a reply from another address, or to another query if it has no address."""
         if isinstance(self.profile.link, ByteFrames):

@@ -59,6 +59,10 @@ class EmulatedWire:
     def refusal(self, request: bytes) -> EmulatedReply | None:
         """Return an answer that refuses the request."""
 
+    def written(self, request: bytes) -> set[str]:
+        """Return the names of the outputs that a request writes, and of their axes."""
+        return set()
+
     def mark_invalid(self, until_ns: int) -> None:
         """Mark the readings of all devices as invalid until a time."""
         for device in self.devices:
@@ -83,6 +87,10 @@ class SerialDevice(EmulatedDevice):
     @abstractmethod
     def refusal(self, message: bytes) -> EmulatedReply | None:
         """Return an answer that refuses the message."""
+
+    @abstractmethod
+    def written(self, message: bytes) -> set[str]:
+        """Return the outputs that a message writes."""
 
     @abstractmethod
     def wrong_id(self, reply: bytes) -> bytes:
@@ -180,6 +188,10 @@ class EmulatedLine(EmulatedWire):
     def refusal(self, request: bytes) -> EmulatedReply | None:
         """Return the refusal of the first device that gives one."""
         return self.devices[0].refusal(request)
+
+    def written(self, request: bytes) -> set[str]:
+        """See :meth:`EmulatedWire.written`."""
+        return set[str]().union(*(each.names(each.written(request)) for each in self.devices))
 
     def encode(self, data: bytes) -> bytes:
         """Return a reply in the form sent on the line."""

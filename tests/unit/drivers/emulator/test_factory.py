@@ -135,7 +135,10 @@ def test_each_output_moves_its_own_rig(emulate, tmp_path, profile, reader, outpu
         str(tmp_path / name) if name == "gcs.yaml" else name for name in (profile, reader)
     )
     terminals = zip(outputs, sensors, strict=True)
-    rigs = tuple(RigOptions(*each, actuator=PiezoOptions(noise=False)) for each in terminals)
+    still = PiezoOptions(noise=False)
+    rigs = tuple(
+        RigOptions(*each, still, axis=axis) for axis, each in zip("xy", terminals, strict=True)
+    )
     made = emulate(profile, reader=reader, rigs=rigs)
     emulator, shown = made.emulator, made.emulator.reader
     emulator.device._set_terminal(outputs[1], 4.0, "write", made.now_ns)
@@ -150,7 +153,9 @@ def test_each_output_moves_its_own_rig(emulate, tmp_path, profile, reader, outpu
     sections = emulator.sections
     assert tuple(each["output"] for each in sections) == outputs
     assert tuple(each["input"] for each in sections) == sensors
-    assert [each["output"] for each in made.writes()] == [outputs[1]]
+    (write,) = made.writes()
+    assert (write["output"], write["axis"]) == (outputs[1], "y")
+    assert write["drive_v"] == emulator.rigs[1].rig.command
 
 
 @pytest.mark.parametrize("second", [("DAC0", "AIN1"), ("DAC1", "AIN0")])

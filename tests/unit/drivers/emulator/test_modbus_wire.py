@@ -4,12 +4,15 @@ import pytest
 
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.modbus.pdu import (
+    feedback_pdu,
+    read_frame,
     read_pdu,
     reply_data,
     rtu_adu,
     rtu_pdu,
     tcp_adu,
     tcp_pdu,
+    write_frame,
     write_pdu,
     write_read_pdu,
 )
@@ -53,6 +56,24 @@ def test_refusals_change_nothing(t7, pdu, code):
         ask(t7, pdu)
     assert refusal.value.code == code
     assert FLOAT32.decode(ask(t7, read_pdu(3, 1000, 2))) == 2.0
+
+
+@pytest.mark.parametrize(("profile", "pdu", "written"), [
+    ("labjack_t7", write_pdu(1000, bytes(4)), {"DAC0"}),
+    ("labjack_t7", write_pdu(1000, bytes(8)), {"DAC0", "DAC1"}),
+    ("labjack_t7", read_pdu(3, 1000, 2), set()),
+    ("labjack_t7", write_pdu(61600, bytes(4)), set()),
+    ("labjack_t7", feedback_pdu(read_frame(1000, 2), write_frame(1002, bytes(4))), {"DAC1"}),
+    ("labjack_t7", b"\x10\x03", set()),
+    ("wago_750", b"\x06\x00\x01\x00\x00", {"AO1"}),
+    ("wago_750", write_read_pdu(0, 2, 1, bytes(2)), {"AO1"}),
+    ("wago_750", b"\x05\x00\x01\xff\x00", set()),
+])  # fmt: skip
+def test_outputs_that_a_request_writes(profile, pdu, written):
+    output, source = ("DAC0", "AIN0") if profile == "labjack_t7" else ("AO0", "AI0")
+    wire = ModbusWire("tcp", {1: emulated_modbus(profile, output, source)})
+    (request,) = requests(wire, tcp_adu(7, 1, pdu))
+    assert wire.written(request) - {""} == written
 
 
 def test_requests_in_one_segment_are_all_answered(t7):

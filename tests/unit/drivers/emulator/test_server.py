@@ -36,6 +36,9 @@ class EchoWire(EmulatedWire):
     def refusal(self, request):
         return EmulatedReply(b"!")
 
+    def written(self, request):
+        return {request.decode()}
+
 
 class Served:
     """A server that runs in a thread, in a time that the test makes pass, and its ptys."""
@@ -77,6 +80,13 @@ def serving():
 def test_faults_happen_on_the_first_line_only(serving):
     server = serving(EchoWire(), EchoWire(), faults=["exception@2"])
     assert [server.ask(b"a", which) for which in (1, 0, 1, 0, 0)] == [b"a", b"a", b"a", b"!", b"a"]
+
+
+def test_one_output_may_refuse(serving):
+    server = serving(EchoWire(), faults=["y:exception@2"])
+    assert [server.ask(data) for data in (b"y", b"x", b"y", b"x", b"y")] == [
+        b"y", b"x", b"!", b"x", b"!",
+    ]  # fmt: skip
 
 
 def test_an_unplugged_line_is_gone_and_the_other_stays(serving):

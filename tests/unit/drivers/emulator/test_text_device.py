@@ -107,6 +107,20 @@ def test_gen_refuses_with_its_codes(emulate):
     assert supply.ask(b"PC?") == b"05.000"
 
 
+@pytest.mark.parametrize(("profile", "message", "written"), [
+    ("tdk_lambda_gen", b"PC 5.000", {"current"}),
+    ("tdk_lambda_gen", b"PC?", set()),
+    ("pi_e727", b"SVA 1 2.5000", {"axis1"}),
+    ("kepco_bop", b"CURR 3.000000;:MEAS:CURR?", {"current"}),
+    ("cobs_board", b"\x10\x01\x01\0\0\0\0\0", {"DAC"}),
+    ("cobs_board", b"\x14\x01", set()),
+])  # fmt: skip
+def test_outputs_that_a_message_writes(emulate, profile, message, written):
+    reader = None if profile in {"pi_e727", "cobs_board"} else "agilent_34970a"
+    made = emulate(profile, reader=reader)
+    assert made.emulator.wires[0].written(message) - {""} == written
+
+
 class TestFrames:
     @pytest.fixture
     def supply(self, emulate):
