@@ -181,10 +181,15 @@ class TestAxes:
         assert settings == [f"axes.{axis}.device.tcp_port={port}" for axis in "xy"]
 
     def test_axes_on_several_devices_are_served_together(self, path):
-        said, settings = said_of(path, "--set", "axes.y.device.tcp_port=5020")
+        said, settings = said_of(path, "--set", "axes.y.device.host=localhost")
         assert len({each["address"] for each in said["devices"]}) == 2
-        port = said["devices"][0]["address"].rpartition(":")[2]
-        assert settings == ["axes.y.device.tcp_port=5020", f"axes.x.device.tcp_port={port}"]
+        first, second = (each["address"].rpartition(":")[2] for each in said["devices"])
+        assert settings == [
+            "axes.y.device.host=localhost",
+            f"axes.x.device.tcp_port={first}",
+            "axes.y.device.host=127.0.0.1",
+            f"axes.y.device.tcp_port={second}",
+        ]
 
     def test_one_axis_is_emulated_alone(self, path):
         said, settings = said_of(path, "--set", "axis=y")
