@@ -28,7 +28,7 @@ from hilctl_drivers.emulator.factory import Emulator, build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.modbus_wire import ModbusWire
 from hilctl_drivers.emulator.options import EmulatorOptions, RigOptions
-from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WiredRig, WriteLog
+from hilctl_drivers.emulator.rig import Bench, SimulatedWiring, Stage, WiredRig, WriteLog
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.transport.links import LostError, NoAnswerError
@@ -463,11 +463,13 @@ class InProcess:
         """
         loaded = load_profile(profile)
         time, writes = VirtualTime(), WriteLog(log, 0)
+        actuators = {n: SimulatedTerfenol(TerfenolOptions(noise=noise)) for n in range(rigs)}
+        stage = Stage(time.now_ns, actuators)
         driven, shown = {}, {}
-        for output, sensor, _ in zip(loaded.outputs, loaded.inputs, range(rigs), strict=False):
-            actuator = SimulatedTerfenol(TerfenolOptions(noise=noise))
-            wiring = SimulatedWiring.spread(loaded.outputs[output], loaded.inputs[sensor], actuator)
-            driven[output] = shown[sensor] = WiredRig(Rig(time.now_ns, actuator), wiring)
+        for output, sensor, rig in zip(loaded.outputs, loaded.inputs, stage.rigs, strict=False):
+            channels = loaded.outputs[output], loaded.inputs[sensor]
+            wiring = SimulatedWiring.spread(*channels, rig.actuator)
+            driven[output] = shown[sensor] = WiredRig(rig, wiring)
         device = EmulatedModbus(loaded, Bench(driven, shown, writes), current_a)
         wire = ModbusWire("tcp", {loaded.unit_id: device})
         return cls(device, tuple(driven.values()), link(wire, time, message_s), time, writes)

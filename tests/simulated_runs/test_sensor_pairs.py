@@ -188,7 +188,7 @@ class SentBlocks:
     def _keep(self, now_ns):
         data = self._block(now_ns)
         self.sent_ns.append(time.monotonic_ns())
-        self.shown_um.append(self._reader._wired[0].rig.displacement_um)
+        self.shown_um.append(self._reader._first.rig.displacement_um)
         return data
 
     def last_read_um(self, device, before_ns, read_um):

@@ -1,7 +1,7 @@
 """An emulated microcontroller board: protocol 2 in front of the simulated rig."""
 
 import math
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 
 import numpy as np
 
@@ -25,12 +25,13 @@ class EmulatedBoard(SerialDevice):
     def __init__(self, profile: FrameProfile, bench: Bench) -> None:
         self._name, self._range = next(iter(profile.outputs.items()))
         super().__init__(profile, bench)
-        self._rig, self._wiring = self._wired[0].rig, self._wired[0].wiring
+        self._rig, self._wiring = self._first.rig, self._first.wiring
         self._outputs = BoardValues(self._range)
         self._inputs = BoardValues(next(iter((profile.inputs or profile.outputs).values())))
         streaming = profile.streaming
         self._streaming = streaming if isinstance(streaming, FrameStreaming) else None
-        self.fifo = SampleFifo(self._rig.actuator, repeats=False, on_played=self._played)
+        self.fifo = SampleFifo(self._rig.stage, repeats=False, on_played=self._played)
+        (self.queue,) = self.fifo.queues
         self._prefill = 0
         self._readings = np.empty(0)
         self._played_um = 0.0
@@ -50,9 +51,9 @@ class EmulatedBoard(SerialDevice):
             self._kinds[board.STATE] = self._state
         low, high = self._range.limits
         # The power-up value is 0 at the terminal, not at the actuator.
-        self.fifo.command = self._wiring.command(min(max(0.0, low), high))
+        self.queue.command = self._wiring.command(min(max(0.0, low), high))
         if self._driven:
-            self._rig.put_out(self.fifo.command, 0)
+            self._rig.put_out(self.queue.command, 0)
 
     def _trip(self, due_ns: int) -> None:
         self.fifo.advance(due_ns)
@@ -93,7 +94,7 @@ class EmulatedBoard(SerialDevice):
     @property
     def queued(self) -> int:
         """Values taken since the clock was set."""
-        return self.fifo.played + self.fifo.level
+        return self.fifo.played + self.queue.level
 
     def _values(self, data: bytes, count: int = 1) -> F64:
         """Return the values of a message, all good."""
@@ -131,10 +132,10 @@ class EmulatedBoard(SerialDevice):
             raise RejectedRequest(Status.BAD_MESSAGE)
         if first != self.queued & 0xFFFFFFFF:
             raise RejectedRequest(Status.WRONG_FIRST)
-        if fifo.level + count > streaming.fifo_depth:
+        if self.queue.level + count > streaming.fifo_depth:
             raise RejectedRequest(Status.FIFO_FULL)
-        fifo.queue(self._wiring.command(values))
-        if not fifo.started and fifo.level >= self._prefill:
+        self.queue.put(self._wiring.command(values))
+        if not fifo.started and self.queue.level >= self._prefill:
             fifo.start(self._now_ns)
         until = max(0, self.queued - self._prefill)
         due_ns, head = fifo.due_ns(until) if until else 0, self._head
@@ -151,7 +152,7 @@ class EmulatedBoard(SerialDevice):
         readings, self._readings = np.split(self._readings, [count])
         self._returned += count
         fields = board.STREAM_FIELDS.pack(first & 0xFFFFFFFF, readings.size)
-        tail = board.FIFO_TAIL.pack(min(fifo.level, 0xFFFF), min(fifo.underruns, 0xFFFF))
+        tail = board.FIFO_TAIL.pack(min(self.queue.level, 0xFFFF), min(fifo.underruns, 0xFFFF))
         return head + _GOOD + fields + self._inputs.encode(self._at_terminal(readings)) + tail
 
     def _watchdog(self, body: bytes) -> bytes:
@@ -174,9 +175,9 @@ class EmulatedBoard(SerialDevice):
     def _stop(self) -> None:
         """Stop streaming and discard its state; the output holds its value."""
         if self.fifo.started:
-            self._rig.put_out(self.fifo.command, self._now_ns)
+            self._rig.put_out(self.queue.command, self._now_ns)
         self.fifo.stop()
-        self.fifo.clear()
+        self.queue.clear()
         self._readings, self._returned = np.empty(0), 0
 
     def _info(self, body: bytes) -> bytes:
@@ -190,7 +191,7 @@ class EmulatedBoard(SerialDevice):
     def _state(self, body: bytes) -> bytes:
         if body:
             raise RejectedRequest(Status.BAD_MESSAGE)
-        output = self._outputs.encode(np.array([self._wiring.output(self.fifo.command)]))
+        output = self._outputs.encode(np.array([self._wiring.output(self.queue.command)]))
         read_um = self._played_um if self.fifo.started else self._rig.displacement_um
         reading = self._inputs.encode(self._at_terminal(np.array([read_um])))
         return board.STATE_REPLY.pack(board.StateFlag.TRIPPED * self.tripped) + output + reading
@@ -210,9 +211,12 @@ class EmulatedBoard(SerialDevice):
 
     def _put_out(self, value: float, event: str, now_ns: int) -> None:
         self._set_terminal(self._name, value, event, now_ns)
-        self.fifo.command = self._wiring.command(value)
+        self.queue.command = self._wiring.command(value)
 
-    def _played(self, first: int, command: F64, displacement_um: F64, now_ns: int) -> None:
+    def _played(
+        self, first: int, commands: Sequence[F64], displacements_um: Sequence[F64], now_ns: int
+    ) -> None:
+        (command,), (displacement_um,) = commands, displacements_um
         self._readings = np.concatenate([self._readings, displacement_um])
         self._played_um = float(displacement_um[-1])
         self._log_played(self._name, first, command, now_ns)

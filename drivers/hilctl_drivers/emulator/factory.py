@@ -7,6 +7,7 @@ or each has a port of its own, with any protocol.
 import time
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass
+from itertools import starmap
 from typing import Any, Literal, NamedTuple, TypeAlias, cast
 
 from hilctl.base.errors import InputError
@@ -19,8 +20,8 @@ from hilctl_drivers.emulator.options import EmulatorOptions, LinkKind, ReaderLin
 from hilctl_drivers.emulator.rig import (
     ACTUATORS,
     Bench,
-    Rig,
     SimulatedWiring,
+    Stage,
     WiredRig,
     WriteLog,
 )
@@ -127,7 +128,8 @@ class _Plan:
         outputs, sensors = list(profile.outputs), list(reader.sensor_inputs)
         faults = {each.kind for each in options.faults}
         self._terminals: list[tuple[str, str]] = []  # output and input of each rig
-        self._rigs: list[tuple[SimulatedDevice, SimulatedWiring]] = []
+        self._rigs: dict[str, tuple[SimulatedDevice, SimulatedWiring]] = {}
+        """By axis, or by output without axes."""
         for each in options.rigs:
             output = _chosen("output to drive the rig with", each.output, outputs, profile)
             sensor = _chosen("input to show a displacement at", each.sensor, sensors, reader)
@@ -138,11 +140,8 @@ class _Plan:
                     f"fault invalid: {sensor} of {reader.title} has no validity, invalid or valid"
                 )
             self._terminals.append((output, sensor))
-            self._rigs.append(_rig(each, profile.outputs[output], source))
-        for names in zip(*self._terminals, strict=True):
-            for name in names:
-                if names.count(name) > 1:
-                    raise InputError(f"{name} must not have two rigs")
+            self._rigs[each.axis or output] = _rig(each, profile.outputs[output], source)
+        self._check_rigs()
         if "stall" in faults and not isinstance(reader, StreamProfile):
             raise InputError(f"fault stall: {reader.title} sends no unsolicited samples")
         self._apart = reader is not profile and not self._may_share(options.reader_line)
@@ -150,6 +149,17 @@ class _Plan:
         self.reader_unit_id = self._unit_of_reader()
         if "reset" in faults and not (self._served.tcp and self._shown.tcp):
             raise InputError("fault reset is for tcp: a serial line has no connection to break")
+
+    def _check_rigs(self) -> None:
+        """Raise InputError if rigs share a terminal, or one sees an axis that is not here."""
+        for names in zip(*self._terminals, strict=True):
+            for name in names:
+                if names.count(name) > 1:
+                    raise InputError(f"{name} must not have two rigs")
+        for actuator, _ in self._rigs.values():
+            for axis in actuator.crosstalk.keys() - self._rigs.keys():
+                here = ", ".join(self._rigs)
+                raise InputError(f"crosstalk of {axis}: must be an axis of the device ({here})")
 
     def _may_share(self, wanted: ReaderLine | None) -> bool:
         """Return whether the reader is on the line of the device; raise InputError if it cannot."""
@@ -179,11 +189,11 @@ class _Plan:
         return reader.unit_id + (reader.unit_id == profile.unit_id) if wanted is None else wanted
 
     def rigs(self, now_ns: int) -> tuple[WiredRig, ...]:
-        """Return the rigs, at rest."""
-        return tuple(
-            WiredRig(Rig(now_ns, actuator), wiring, each.axis)
-            for each, (actuator, wiring) in zip(self._options.rigs, self._rigs, strict=True)
-        )
+        """Return the rigs of a stage, at rest."""
+        stage = Stage(now_ns, {axis: actuator for axis, (actuator, _) in self._rigs.items()})
+        axes = (each.axis for each in self._options.rigs)
+        wirings = (wiring for _, wiring in self._rigs.values())
+        return tuple(starmap(WiredRig, zip(stage.rigs, wirings, axes, strict=True)))
 
     def devices(
         self, rigs: Sequence[WiredRig], log: WriteLog
@@ -221,7 +231,7 @@ class _Plan:
 
     def channels(self) -> Iterator[dict[str, Any]]:
         """Yield the part of each rig's device section with profile, channels and wiring."""
-        for (output, source), (_, wiring) in zip(self._terminals, self._rigs, strict=True):
+        for (output, source), (_, wiring) in zip(self._terminals, self._rigs.values(), strict=True):
             made: dict[str, Any] = {
                 "profile": self._options.profile,
                 "output": output,
@@ -343,9 +353,11 @@ def _rig(
 
 def _stroke_um(actuator: TerfenolOptions, command: float) -> float:
     """Return the displacement of an actuator in um, some time after a step to a command."""
-    rig = Rig(0, SimulatedTerfenol(actuator))
+    alone = actuator.model_copy(update={"crosstalk": {}})
+    stage = Stage(0, {"": SimulatedTerfenol(alone)})
+    (rig,) = stage.rigs
     rig.put_out(command, 0)
-    rig.advance(_SETTLED_NS)
+    stage.advance(_SETTLED_NS)
     return abs(rig.displacement_um)
 
 

@@ -1,11 +1,11 @@
-"""Stream-out and stream-in of an emulated LabJack T4 or T7: registers in front of FIFOs.
+"""Stream-out and stream-in of an emulated LabJack T4 or T7: registers in front of a FIFO.
 
 It follows :mod:`hilctl_drivers.labjack.stream`. Two behaviours are assumptions, because no document
 describes them: a trip of the watchdog ends the stream, and the order of queued sets of values.
 """
 
 import struct
-from collections.abc import Callable
+from collections.abc import Callable, Sequence, Set
 from functools import partial
 
 import numpy as np
@@ -89,23 +89,23 @@ class LabJackInput:
 class StreamedOutput:
     """An output that the stream can change, with the rig between it and an input."""
 
-    def __init__(self, name: str, channel: ModbusOutput, sensor: int, wired: WiredRig) -> None:
-        self.name, self.sensor, self.rig, self.wiring = name, sensor, wired.rig, wired.wiring
+    def __init__(
+        self, name: str, channel: ModbusOutput, sensor: int, wired: WiredRig, fifo: SampleFifo
+    ) -> None:
+        self.name, self.sensor, self.wiring = name, sensor, wired.wiring
+        self.number = wired.rig.stage.rigs.index(wired.rig)
+        self.queue = fifo.queues[self.number]
         self._limits = channel.limits
-        self.fifo = SampleFifo(wired.rig.actuator, repeats=True, on_played=self._played)
         self._pending: list[F64] = []
-        self.first = 0
-        self.command, self.displacement_um = np.empty((2, 0))
-        """Commands of the scans since the last :meth:`advance`, and the readings before each."""
 
     @property
     def held(self) -> int:
-        """Values that wait in its buffer."""
-        return self.fifo.level + sum(part.size for part in self._pending)
+        """Values in its buffer."""
+        return self.queue.level + sum(part.size for part in self._pending)
 
     def clear(self) -> None:
         """Empty its buffer."""
-        self.fifo.clear()
+        self.queue.clear()
         self._pending.clear()
 
     def take(self, values: F64) -> None:
@@ -119,24 +119,8 @@ class StreamedOutput:
     def use(self) -> None:
         """Let the buffered values follow those that are still to be output."""
         for values in self._pending:
-            self.fifo.queue(self.wiring.command(values))
+            self.queue.put(self.wiring.command(values))
         self._pending.clear()
-
-    def start(self, rate_hz: float, now_ns: int) -> None:
-        """Start scans with the present output."""
-        self.fifo.command = self.rig.command
-        self.fifo.set_rate(rate_hz)
-        self.fifo.start(now_ns)
-
-    def advance(self, now_ns: int, *, streamed: bool) -> None:
-        """Scan until a time; an output that is not in the scan list keeps its own value."""
-        if not streamed:
-            self.fifo.command = self.rig.command
-        self.command = self.displacement_um = np.empty(0)
-        self.fifo.advance(now_ns)
-
-    def _played(self, first: int, command: F64, displacement_um: F64, now_ns: int) -> None:
-        self.first, self.command, self.displacement_um = first, command, displacement_um
 
 
 class LabJackStream:
@@ -150,17 +134,17 @@ class LabJackStream:
         *,
         on_played: Callable[[str, int, F64, int], None],
     ) -> None:
-        self._streaming = streaming
+        self._streaming, self._stage = streaming, bench.first.rig.stage
+        self.fifo = SampleFifo(self._stage, repeats=True, on_played=self._played)
         self.outputs: dict[int, StreamedOutput] = {}
         """By address; those with a rig whose input can stream too."""
         for (name, wired), sensor in zip(bench.driven.items(), bench.shown, strict=False):
             if name in streaming.outputs and sensor in streaming.inputs:
                 output, source = profile.outputs[name], profile.wire_address(profile.inputs[sensor])
-                made = StreamedOutput(name, output, source, wired)
+                made = StreamedOutput(name, output, source, wired, self.fifo)
                 self.outputs[profile.wire_address(output)] = made
         self._streamed: list[StreamedOutput] = []  # in the scan list
         self._scanned: list[int] = []  # inputs in the scan list
-        self.running = False
         self._analog = {profile.wire_address(each) for each in profile.inputs.values()}
         self._on_played = on_played
         self.input = LabJackInput(streaming)
@@ -170,7 +154,7 @@ class LabJackStream:
             stream.ENABLE: self._enable,
         }
         self._reads: dict[int, Callable[[int], bytes]] = {
-            stream.ENABLE: lambda count: stream.u32(int(self.running)),
+            stream.ENABLE: lambda count: stream.u32(int(self.fifo.running)),
             stream.DATA_CR: self._data,
             stream.FLASH_READ: self._read_flash,
         }
@@ -185,29 +169,35 @@ class LabJackStream:
         """Return whether an address belongs to the stream; inputs do while it runs."""
         known = address in self._words or address in self._reads or address in self._writes
         scanned = stream.SCANLIST_ADDRESS <= address < stream.SCANLIST_ADDRESS + 256
-        return known or scanned or (self.running and address in self._analog)
+        return known or scanned or (self.fifo.running and address in self._analog)
 
     def tick(self, now_ns: int) -> None:
         """Advance the time."""
         self._now_ns = max(self._now_ns, now_ns)
-        for each in self.outputs.values():
-            each.advance(self._now_ns, streamed=each in self._streamed)
-        if not self._streamed or not self._streamed[0].command.size:
-            return
+        self._hold({each.number for each in self._streamed})
+        self.fifo.advance(self._now_ns)
+
+    def _hold(self, streamed: Set[int]) -> None:
+        """Let the outputs except those in the scan list keep their own values."""
+        for number, rig in enumerate(self._stage.rigs):
+            if number not in streamed:
+                self.fifo.queues[number].command = rig.command
+
+    def _played(
+        self, first: int, commands: Sequence[F64], displacements_um: Sequence[F64], now_ns: int
+    ) -> None:
         for each in self._streamed:
-            self._on_played(each.name, each.first, each.command, self._now_ns)
-        first = self._streamed[0]
-        columns = dict.fromkeys(self._scanned, first.wiring.output(first.command))
+            self._on_played(each.name, first, commands[each.number], now_ns)
+        shown = self._streamed[0]
+        columns = dict.fromkeys(self._scanned, shown.wiring.output(commands[shown.number]))
         for each in self.outputs.values():
-            columns[each.sensor] = each.wiring.at_terminal(each.displacement_um)
+            columns[each.sensor] = each.wiring.at_terminal(displacements_um[each.number])
         self.input.keep(np.column_stack([columns[each] for each in self._scanned]).ravel())
 
     def stop(self, now_ns: int) -> None:
         """Stop streaming at a time, possibly in the past; the output holds its value."""
         self.tick(now_ns)
-        self.running = False
-        for each in self.outputs.values():
-            each.fifo.stop()
+        self.fifo.stop()
 
     def read(self, address: int, count: int) -> bytes:
         """Return register words; raise RejectedRequest if they are not readable, or not now."""
@@ -274,7 +264,7 @@ class LabJackStream:
 
     def _enable(self, data: bytes) -> None:
         starts = data != stream.u32(0)
-        _require(starts != self.running, _FAILURE_EXCEPTION)
+        _require(starts != self.fifo.running, _FAILURE_EXCEPTION)
         if not starts:
             self.stop(self._now_ns)
             return
@@ -294,12 +284,12 @@ class LabJackStream:
         allowed &= self._number(stream.AUTO_TARGET) == stream.COMMAND_RESPONSE
         _require(apart and shown and allowed, _FAILURE_EXCEPTION)
         self.input.start(self._number(stream.BUFFER_SIZE_BYTES))
-        for each in self.outputs.values():
-            each.start(rate_hz, self._now_ns)
-        self.running = True
+        self._hold(set())
+        self.fifo.set_rate(rate_hz)
+        self.fifo.start(self._now_ns)
 
     def _data(self, count: int) -> bytes:
-        _require(self.running, _FAILURE_EXCEPTION)
+        _require(self.fifo.running, _FAILURE_EXCEPTION)
         return self.input.fetch(count)
 
     def _read_flash(self, count: int) -> bytes:

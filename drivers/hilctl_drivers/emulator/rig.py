@@ -2,7 +2,7 @@
 
 import json
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Iterable, Mapping
+from collections.abc import Callable, Iterable, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import IO, Any, TypeAlias
@@ -15,7 +15,7 @@ from hilctl.base.samples import COLUMNS
 from hilctl.base.types import F64, CommandUnit
 from hilctl_drivers.profile_base import BaseProfile, Range
 from hilctl_drivers.signal_chain import Amplifier, Sensor, SignalChain
-from hilctl_drivers.simulated.actuator_base import Plant
+from hilctl_drivers.simulated.crosstalk import CoupledPlants
 from hilctl_drivers.simulated.devices import SimulatedPiezo, SimulatedTerfenol
 from hilctl_drivers.simulated.simulated_device import SimulatedDevice
 
@@ -25,41 +25,61 @@ ACTUATORS: dict[CommandUnit, type[SimulatedDevice]] = {"A": SimulatedTerfenol, "
 """The actuator behind an emulated device, by the unit of its drive."""
 
 
-class Rig:
-    """The actuator with its amplifier and sensor, in real time, from rest at ``now_ns``.
+class Stage:
+    """Rigs in real time, from rest at ``now_ns``; a sensor may see the displacement of another rig.
 
-    The caller supplies the time. The rig has held its output since the last change, and its sensor
-    shows the last sample of its own clock, so readings are one to two periods of this clock old.
+    The caller supplies the time. Each rig has held its output since the last change, and its sensor
+    shows the last sample of the stage's clock, so readings are one to two periods of it old.
+
+    Args:
+        now_ns: The present time.
+        actuators: Actuators by axis; of one axis, its name may be empty.
     """
 
-    def __init__(self, now_ns: int, actuator: SimulatedDevice) -> None:
-        self.actuator = actuator
-        self._plant = actuator.plant(RATE_HZ)
+    def __init__(self, now_ns: int, actuators: Mapping[str, SimulatedDevice]) -> None:
+        self._actuators = actuators
+        self.rigs = tuple(Rig(self, each) for each in actuators.values())
+        self._plants = self.plants(RATE_HZ)
         self._origin_ns = now_ns
         self._samples = 1
-        self.command = 0.0
-        self.displacement_um = 0.0
         self._step(1)
 
+    def plants(self, rate_hz: float) -> CoupledPlants:
+        """Return the plants of all rigs at rest, in their order."""
+        plants = {axis: each.plant(rate_hz) for axis, each in self._actuators.items()}
+        crosstalk = {axis: each.crosstalk for axis, each in self._actuators.items()}
+        return CoupledPlants(plants, crosstalk, rate_hz)
+
     def advance(self, now_ns: int) -> None:
-        """Advance the time until ``now_ns``, with the output held."""
+        """Advance the time until ``now_ns``, with the outputs held."""
         due = int((now_ns - self._origin_ns) * RATE_HZ * 1e-9)
         if due > self._samples:
             # Nothing changes any more on a held output, and catching up with hours takes minutes.
             self._step(min(due - self._samples, int(SETTLED_S * RATE_HZ)))
             self._samples = due
 
+    def _step(self, count: int) -> None:
+        commands = [each.command for each in self.rigs]
+        self._plants.hold(count - 1, commands)
+        read_um, read = np.empty((2, len(commands), 1))
+        self._plants.step([*np.array([commands]).T], [*read_um], [*read])
+        for rig, (displacement_um,) in zip(self.rigs, read_um.tolist(), strict=True):
+            rig.displacement_um = displacement_um
+
+
+class Rig:
+    """An actuator with its amplifier and sensor, on a stage."""
+
+    def __init__(self, stage: Stage, actuator: SimulatedDevice) -> None:
+        self.stage, self.actuator = stage, actuator
+        self.command = 0.0
+        self.displacement_um = 0.0
+
     def put_out(self, command: float, now_ns: int) -> None:
         """Change the output; the amplifier saturates at the actuator's range."""
-        self.advance(now_ns)
+        self.stage.advance(now_ns)
         info = self.actuator.info
         self.command = min(max(command, info.command_min), info.command_max)
-
-    def _step(self, count: int) -> None:
-        read_um, read = np.empty((2, 1))
-        self._plant.hold(count - 1, self.command)
-        self._plant.step(np.array([self.command]), read_um, read)
-        self.displacement_um = float(read_um[0])
 
 
 class SimulatedWiring(SignalChain):
@@ -173,7 +193,7 @@ class WiredRig:
 
 @dataclass(frozen=True, slots=True)
 class Bench:
-    """The rigs at the terminals of one device, at least one, and the log of its outputs.
+    """The rigs of a stage at the terminals of one device, and the log of its outputs.
 
     If it has both outputs and inputs, they are in the same order.
     """
@@ -181,6 +201,11 @@ class Bench:
     driven: Mapping[str, WiredRig]  # by output
     shown: Mapping[str, WiredRig]  # by input
     log: WriteLog
+
+    @property
+    def first(self) -> WiredRig:
+        """The first rig."""
+        return next(iter((self.driven or self.shown).values()))
 
 
 class EmulatedDevice(ABC):
@@ -191,7 +216,7 @@ class EmulatedDevice(ABC):
     def __init__(self, profile: BaseProfile, bench: Bench) -> None:
         self.profile = profile
         self._driven, self._shown, self._log = bench.driven, bench.shown, bench.log
-        self._wired = (*bench.driven.values(), *bench.shown.values())
+        self._first = bench.first
         self._timer = WatchdogTimer()
         self._now_ns = 0
         self.invalid_until_ns = 0
@@ -229,15 +254,14 @@ class EmulatedDevice(ABC):
         """Apply a watchdog trip to the outputs."""
 
     def _advance(self) -> None:
-        for each in self._wired:
-            each.rig.advance(self._now_ns)
+        self._first.rig.stage.advance(self._now_ns)
 
     def _reading(self, name: str, source: Range) -> float:
         """Return the reading of an input: a displacement, or the first output for all others."""
         if name in self._shown:
             shown = self._shown[name]
             return float(shown.wiring.at_terminal(shown.rig.displacement_um))
-        first = self._wired[0]
+        first = self._first
         return float(first.wiring.monitor(np.asarray(first.rig.command), source))
 
     def _set_terminal(self, name: str, value: float, event: str, now_ns: int) -> None:
@@ -263,25 +287,54 @@ class EmulatedDevice(ABC):
 
 _SETTLED_S = 0.1
 
-Played: TypeAlias = Callable[[int, F64, F64, int], None]
-"""First value's number, float64[n] commands, float64[n] readings in um, time of the last."""
+Played: TypeAlias = Callable[[int, Sequence[F64], Sequence[F64], int], None]
+"""First value's number, commands and readings in um, float64[n] per rig, time of the last."""
+
+
+class SampleQueue:
+    """Values of one output that wait for their periods; it holds the last one."""
+
+    def __init__(self) -> None:
+        self._values = np.empty(0)
+        self.command = 0.0
+
+    @property
+    def level(self) -> int:
+        """Number of values."""
+        return self._values.size
+
+    def put(self, command: F64) -> None:
+        """Queue float64[n]."""
+        self._values = np.concatenate([self._values, command])
+
+    def clear(self) -> None:
+        """Discard the values."""
+        self._values = np.empty(0)
+
+    def take(self, periods: int) -> F64:
+        """Return and remove the commands of the next periods, float64[periods]."""
+        values, self._values = np.split(self._values, [periods])
+        if values.size:
+            self.command = float(values[-1])
+        return np.concatenate([values, np.full(periods - values.size, self.command)])
 
 
 class SampleFifo:
-    """FIFO that outputs one value per period; a period without one holds or ``repeats`` it."""
+    """FIFO of a stage's rigs, each of which outputs one value per period of a common clock.
 
-    def __init__(self, actuator: SimulatedDevice, *, repeats: bool, on_played: Played) -> None:
-        self._actuator = actuator
+    A period without a value holds or ``repeats`` the last one.
+    """
+
+    def __init__(self, stage: Stage, *, repeats: bool, on_played: Played) -> None:
+        self._stage = stage
+        self.queues = tuple(SampleQueue() for _ in stage.rigs)
         self._repeats = repeats
         self._on_played = on_played
-        self._plant: Plant | None = None
-        self._plant_rate_hz = 0.0
+        self._plants: CoupledPlants | None = None
+        self._plants_rate_hz = 0.0
         self._rate_hz = 0.0
         self._start_ns: int | None = None
-        self._queued = np.empty(0)
         self._periods = 0
-        self.command = 0.0
-        self.level = 0  # values that are queued
         self.played = 0  # values output since the rate was set
         self.underruns = 0  # periods since then that found nothing queued
 
@@ -297,11 +350,11 @@ class SampleFifo:
 
     def set_rate(self, rate_hz: float) -> None:
         """Stop, and count from 0 at another rate after :meth:`start`; queued values stay."""
-        if self._plant is None or self._plant_rate_hz != rate_hz:
-            self._plant = self._actuator.plant(rate_hz)
-            self._plant_rate_hz = rate_hz
-        # It compiles the plant too, which would be late once the clock runs.
-        self._plant.hold(round(_SETTLED_S * rate_hz), self.command)
+        if self._plants is None or self._plants_rate_hz != rate_hz:
+            self._plants = self._stage.plants(rate_hz)
+            self._plants_rate_hz = rate_hz
+        # It compiles the plants too, which would be late once the clock runs.
+        self._plants.hold(round(_SETTLED_S * rate_hz), [each.command for each in self.queues])
         self.stop()
         self._rate_hz = rate_hz
         self._periods = self.played = self.underruns = 0
@@ -311,19 +364,9 @@ class SampleFifo:
         self._start_ns = now_ns
 
     def stop(self) -> None:
-        """Stop; queued values stay, and the output holds its value."""
+        """Stop; queued values stay, and the outputs hold their values."""
         self._rate_hz = 0.0
         self._start_ns = None
-
-    def clear(self) -> None:
-        """Discard queued values."""
-        self._queued = np.empty(0)
-        self.level = 0
-
-    def queue(self, command: F64) -> None:
-        """Queue float64[n]."""
-        self._queued = np.concatenate([self._queued, command])
-        self.level += command.size
 
     def due_ns(self, values: int) -> int | None:
         """Return when that many values will have been output; None before the start."""
@@ -333,22 +376,19 @@ class SampleFifo:
 
     def advance(self, now_ns: int) -> None:
         """Output the values due by now; repeat or hold the last value if none is queued."""
-        if self._start_ns is None or self._plant is None:
+        if self._start_ns is None or self._plants is None:
             return
         due = int((now_ns - self._start_ns) * self._rate_hz * 1e-9 + 1e-6) - self._periods
         if due <= 0:
             return
         self._periods += due
-        values, self._queued = np.split(self._queued, [due])
-        self.level -= values.size
-        missed = due - values.size
-        self.underruns += missed
-        played = due if self._repeats else values.size
-        if values.size:
-            self.command = float(values[-1])
-        command = np.concatenate([values, np.full(missed, self.command)])
-        displacement_um, measured = np.empty(due), np.empty(due)
-        self._plant.step(command, displacement_um, measured)
+        queued = min(due, max(each.level for each in self.queues))
+        self.underruns += due - queued
+        played = due if self._repeats else queued
+        commands = [each.take(due) for each in self.queues]
+        displacements_um, measured = np.empty((2, len(commands), due))
+        self._plants.step(commands, [*displacements_um], [*measured])
         if played:
-            self._on_played(self.played, command[:played], displacement_um[:played], now_ns)
+            read_um = [each[:played] for each in displacements_um]
+            self._on_played(self.played, [each[:played] for each in commands], read_um, now_ns)
             self.played += played

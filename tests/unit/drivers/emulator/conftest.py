@@ -8,7 +8,7 @@ import pytest
 from hilctl_drivers.emulator.factory import build
 from hilctl_drivers.emulator.modbus_device import EmulatedModbus
 from hilctl_drivers.emulator.options import EmulatorOptions, RigOptions
-from hilctl_drivers.emulator.rig import Bench, Rig, SimulatedWiring, WiredRig, WriteLog
+from hilctl_drivers.emulator.rig import Bench, SimulatedWiring, Stage, WiredRig, WriteLog
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from tests.fakes import emulated, logged, one_rig
@@ -22,7 +22,7 @@ def emulated_modbus(name, output, sensor, current_a=None):
     profile = load_profile(name)
     actuator = SimulatedTerfenol(TerfenolOptions())
     wiring = SimulatedWiring.spread(profile.outputs[output], profile.inputs[sensor], actuator)
-    wired = WiredRig(Rig(0, actuator), wiring)
+    wired = WiredRig(Stage(0, {"": actuator}).rigs[0], wiring)
     bench = Bench({output: wired}, {sensor: wired}, WriteLog(None, 0))
     return EmulatedModbus(profile, bench, current_a)
 

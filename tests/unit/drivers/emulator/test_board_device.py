@@ -43,4 +43,4 @@ class TestBoard:
         board.ask(b"\x11\x02" + struct.pack("<IH", 0, 100) + values)
         reply = board.ask(b"\x11\x02" + struct.pack("<IH", 100, 100) + values, after_ms=15)
         assert struct.unpack("<HH", reply[-4:]) == (100, 50)
-        assert board.device.fifo.command == 2.0
+        assert board.device.queue.command == 2.0

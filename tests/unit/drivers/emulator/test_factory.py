@@ -41,7 +41,7 @@ def test_a_piezo_is_scaled_to_its_wiring(emulate, gain, offset_v, um_per_v, low_
     info, rig = made.emulator.rigs[0].rig.actuator.info, made.emulator.rigs[0].rig
     assert (info.command_min, info.command_max) == (low_v, high_v)
     rig.put_out(high_v, made.now_ns)
-    rig.advance(made.now_ns + 10 * MS)
+    rig.stage.advance(made.now_ns + 10 * MS)
     assert rig.displacement_um == pytest.approx(0.8 * 10.0 * abs(um_per_v), rel=0.01)
 
 
@@ -56,7 +56,7 @@ def test_the_limits_rate_the_actuator(emulate):
         wiring = Amplifier.model_validate({gain: 10.0}), Sensor(um_per_v=5.0)
         made = emulate("labjack_t8", actuator=actuator, wiring=wiring, limits=limits, command=0.0)
         made.emulator.rigs[0].rig.put_out(limits[1], made.now_ns)
-        made.emulator.rigs[0].rig.advance(made.now_ns + 10 * MS)
+        made.emulator.rigs[0].rig.stage.advance(made.now_ns + 10 * MS)
         strokes_um.append(made.emulator.rigs[0].rig.displacement_um)
     rated_um, published_um, piezo_um = strokes_um
     assert rated_um > 10.0 * published_um
@@ -70,7 +70,7 @@ def test_rods_keep_to_the_range_of_the_sensor(emulate, um_per_v, stroke_um):
     made = emulate("labjack_t7", wiring=wiring, limits=(0.0, 2.0), command=0.0)
     rig = made.emulator.rigs[0].rig
     rig.put_out(2.0, made.now_ns)
-    rig.advance(made.now_ns + 100 * MS)
+    rig.stage.advance(made.now_ns + 100 * MS)
     low, high = stroke_um
     assert low < rig.displacement_um < high
 
@@ -162,6 +162,13 @@ def test_each_output_moves_its_own_rig(emulate, tmp_path, profile, reader, outpu
 def test_a_terminal_has_one_rig(emulate, second):
     rigs = RigOptions("DAC0", "AIN0"), RigOptions(*second)
     with pytest.raises(InputError, match="must not have two rigs"):
+        emulate("labjack_t7", rigs=rigs)
+
+
+def test_crosstalk_is_of_the_same_device(emulate):
+    seen = PiezoOptions(crosstalk={"z": {"gain": 0.1}})
+    rigs = RigOptions("DAC0", "AIN0", seen, axis="x"), RigOptions("DAC1", "AIN1", axis="y")
+    with pytest.raises(InputError, match="crosstalk of z"):
         emulate("labjack_t7", rigs=rigs)
 
 

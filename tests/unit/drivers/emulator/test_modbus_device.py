@@ -14,5 +14,5 @@ from tests.unit.drivers.emulator.conftest import emulated_modbus
 ])  # fmt: skip
 def test_powers_up_as_its_profile_says(name, output, sensor, more, current_a, value):
     device = emulated_modbus(name, output, sensor, **more)
-    assert device._wired[0].rig.command == pytest.approx(current_a, abs=5e-3)
+    assert device._first.rig.command == pytest.approx(current_a, abs=5e-3)
     assert device._outputs[output].value == pytest.approx(value, abs=2e-3)

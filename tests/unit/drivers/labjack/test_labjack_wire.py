@@ -62,7 +62,7 @@ class DrivenStream:
     @property
     def clock(self):
         """The emulated device's scan clock."""
-        return self.emulated.device.overlay.outputs[DAC0].fifo
+        return self.emulated.device.overlay.fifo
 
 
 @pytest.fixture
