@@ -1,6 +1,7 @@
 """An emulated device of text or fixed frames: a profile's templates in front of the rig."""
 
 import re
+from collections.abc import Iterator
 
 from hilctl_drivers.ascii.ascii_profile import (
     AsciiInput,
@@ -22,6 +23,8 @@ from hilctl_drivers.emulator.wire import EmulatedReply, SerialDevice, TemplateMa
 _OUT_OF_RANGE = '-222,"Data out of range"'
 _UNDEFINED = '-113,"Undefined header"'
 _REFUSED = '-200,"Execution error"'
+_SIGNS = {"+": (("+", 0),), "-": (("+", 0), (" ", 0), ("", 1), ("", 0))}
+"""Signs of positive numbers in replies, and places without a digit, by the sign in the example."""
 
 
 def in_style(example: str, pattern: str, value: float) -> str:
@@ -30,18 +33,25 @@ def in_style(example: str, pattern: str, value: float) -> str:
     found = regex.fullmatch(example)
     assert found is not None, "a profile's examples match their patterns"
     start, stop = found.span(1)
-    model = example[start:stop]
-    sign = "+" if model[0] in "+-" else ""
     if not form.mark:
-        number = form.text(value)
-    elif "E" in model.upper():
-        number = f"{value:{sign}.6E}".replace(".", form.mark)
-    else:
-        decimals = len(model.partition(form.mark)[2])
-        value = round(value, decimals) + 0.0  # no device says -0.000
-        pad = " " if " " in model else "0"
-        number = f"{value:{pad}={sign}{len(model)}.{decimals}f}".replace(".", form.mark)
-    return example[:start] + number + example[stop:]
+        return example[:start] + form.text(value) + example[stop:]
+    replies = [
+        example[:start] + number.replace(".", form.mark) + example[stop:]
+        for number in _numbers(example[start:stop].replace(form.mark, "."), value)
+    ]
+    return next(filter(regex.fullmatch, replies), replies[0])
+
+
+def _numbers(model: str, value: float) -> Iterator[str]:
+    """Yield a number in the forms of a model: of a negative one, a positive may have no sign."""
+    pad = " " if " " in model else "0"
+    decimals = len(model.partition(".")[2])
+    rounded = round(value, decimals) + 0.0  # no device says -0.000
+    for sign, unused in _SIGNS.get(model[0], (("", 0),)):
+        if "E" in model.upper():
+            yield f"{value:{sign}.6E}"
+        else:
+            yield f"{rounded:{pad}={sign}{len(model) - unused}.{decimals}f}"
 
 
 def _with_number(form: NumberReply, reply: str, number: float) -> str:
