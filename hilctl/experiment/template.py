@@ -26,8 +26,8 @@ from hilctl.experiment.devices import (
     shipped_profiles,
     unknown_name,
 )
-from hilctl.experiment.load import resolve
-from hilctl.experiment.preflight import check
+from hilctl.experiment.load import resolve_axes
+from hilctl.experiment.preflight import check_axes
 from hilctl.experiment.sections.feedback import rounded_down
 
 STARTING_SECTION = "hilctl_drivers.template:starting_section"
@@ -129,7 +129,7 @@ def starting_experiment(
     _set(whole, settings)
     head = _head(device, path)
     text = head + commented(whole.data, {**remarks, **device.remarks})
-    check(resolve(Document(str(path), text), path.parent, (), files))
+    check_axes(resolve_axes(Document(str(path), text), path.parent, files))
     return text, made.info
 
 

@@ -256,11 +256,11 @@ def lines_of(driven: Iterable[_D]) -> list[list[_D]]:
     """
     lines: list[tuple[set[str], list[_D]]] = []
     for each in driven:
-        holds, line = set(each.device.info.holds), [each]
-        for other in [other for other in lines if other[0] & holds]:
-            lines.remove(other)
-            holds, line = holds | other[0], other[1] + line
-        lines.append((holds, line))
+        holds = set(each.device.info.holds)
+        shared = [line for line in lines if line[0] & holds]
+        lines = [line for line in lines if not line[0] & holds]
+        joined = [one for _, line in shared for one in line]
+        lines.append((holds.union(*(names for names, _ in shared)), [*joined, each]))
     return [line for _, line in lines]
 
 

@@ -17,9 +17,9 @@ from typing import Any, TypeAlias
 import numpy as np
 
 from hilctl import __version__
+from hilctl.base.axes import axis_documents
 from hilctl.base.errors import ConfigError, InputError, RunError
 from hilctl.base.yaml import Document, loc_of, setting
-from hilctl.experiment.axes import axis_documents
 from hilctl.experiment.load import document_with
 from hilctl.experiment.sections.coupling import Coupling, CrosstalkFilter, write_coupling
 from hilctl.lab.response.fir_fit import fit_fir

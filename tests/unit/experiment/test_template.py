@@ -5,7 +5,7 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.errors import ConfigError, InputError
-from hilctl.experiment.load import load_experiment
+from hilctl.experiment.load import load_axes, load_experiment
 from hilctl.experiment.preflight import check
 from hilctl.experiment.template import starting_device, starting_experiment
 from hilctl_drivers.profile import FOLDER
@@ -50,6 +50,14 @@ def test_settings_of_the_device_move_its_limits(tmp_path):
     assert checked.loaded.config.limits.peak_current_a == 2.0
     assert checked.loaded.config.name == "rig"
     assert "gain_a_per_v: 4  # set:" in text
+
+
+def test_settings_may_name_axes(tmp_path):
+    path = tmp_path / "stage.yaml"
+    seeds = ["axes.x.device.seed=1", "axes.y.device.seed=2"]
+    text, _ = starting_experiment(starting_device("simulated_piezo", tmp_path, "V"), path, seeds)
+    path.write_text(text)
+    assert [each.config.device["seed"] for each in load_axes(path)] == [1, 2]
 
 
 def test_an_own_profile_is_named_from_the_experiments_folder(tmp_path, monkeypatch):
