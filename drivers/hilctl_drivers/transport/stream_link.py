@@ -84,7 +84,7 @@ class StreamLink(ABC):
         self._count_waiting: Callable[[], object] = lambda: None
         self._stale = True
         self._quiet_at = 0.0
-        self._looked_ns = time.monotonic_ns()
+        self._looked_ns = 0
         self._silent_hint = ""  # why there may be no answer; empty after the first one
 
     def set_timeout(self, timeout_s: float) -> None:
@@ -119,6 +119,7 @@ class StreamLink(ABC):
         self._count_waiting = _counts_waiting(fd, self._waiting)
         self._poll = select.poll()
         self._poll.register(fd, select.POLLIN)
+        self._looked_ns = time.monotonic_ns()
 
     def transact(
         self, request: bytes | bytearray, missing: Missing, usual: int = 0
