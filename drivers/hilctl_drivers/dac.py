@@ -18,7 +18,7 @@ from hilctl.base.types import F64
 from hilctl_drivers.dac_setup import DacSetup
 from hilctl_drivers.device import DacDevice, details_of
 from hilctl_drivers.signal_chain import DacOptions, FifoBlocks, Measure
-from hilctl_drivers.transport.links import Link
+from hilctl_drivers.transport.links import ErrorPrefix, Link
 from hilctl_drivers.transport.safe_exchange import SafeExchange
 from hilctl_drivers.transport.serial_port import SerialLink
 from hilctl_drivers.transport.stream_link import StreamLink
@@ -209,6 +209,8 @@ class Dac(DacDevice):
         self._connect(block / sample_rate_hz if wire.fifo_depth else 0.0)
         wire.recover()
         wire.session.set_up()
+        with ErrorPrefix("init"):  # not the safe value, whose message is tried next
+            wire.session.check_errors()
         self.reader.begin()
         wire.start(self.reader, sample_rate_hz, block)
         wire.session.check_errors()

@@ -207,7 +207,8 @@ class AsciiSession(SteppedSession):
                 break
             found.append(reply)
             if len(found) == _ERRORS_MAX:
-                raise RefusedError(f"{text} says {reply}, {_ERRORS_MAX} times", reply)
+                rule = f"{text} says {reply}, {_ERRORS_MAX} times: clear the error at the device"
+                raise RefusedError(rule, reply)
         return found
 
     def identify(self) -> None:

@@ -198,6 +198,25 @@ def test_errors_of_an_earlier_session_end_no_run(rig):
     bench.device.close()
 
 
+def test_errors_of_an_earlier_session_fail_no_probe(rig):
+    bench = rig("kepco_bop", reader="agilent_34970a", own_line=True)
+    for _ in range(3):
+        bench.emulator.device.refusal(b"")
+    assert bench.device.look().output == 0.0
+    assert bench.device.info.details["earlier_errors"].count("-200") == 3
+    bench.open()
+    assert bench.device.info.details["earlier_errors"].count("-200") == 3
+
+
+def test_an_error_of_an_init_step_is_not_the_safe_value_s(rig, tmp_path):
+    text = shipped_profiles()["kepco_bop"].read_text(encoding="utf-8")
+    path = tmp_path / "supply.yaml"
+    path.write_text(text.replace('text: "CURR 0"', 'text: "CURR 99"'), encoding="utf-8")
+    bench = rig(str(path), reader="agilent_34970a", own_line=True)
+    with pytest.raises(DeviceError, match=r"init: SYST:ERR\? says -222"):
+        bench.open()
+
+
 def test_older_errors_do_not_prevent_a_confirmation(rig, tmp_path):
     """Without a read-back, only a query of errors confirms a value."""
     data = yaml.safe_load(shipped_profiles()["kepco_bop"].read_text(encoding="utf-8"))
@@ -275,7 +294,7 @@ def test_a_lost_sensor_is_not_waited_for(rig):
 @pytest.mark.parametrize("kind", WIRES)
 @pytest.mark.parametrize("fault", ["silence", "corrupt", "duplicate", "wrong_id"])
 def test_a_bad_answer_to_the_safe_value_confirms_nothing(rig, kind, fault):
-    message = {"dcon": 15, "scpi": 15, "cobs": 10, "length": 10}[kind.split()[0]]
+    message = {"dcon": 15, "scpi": 16, "cobs": 10, "length": 10}[kind.split()[0]]
     bench = rig(kind, faults=[f"{fault}@{message}"], timeout_s=TIMEOUT_S)
     bench.open()
     for _ in range(5):
