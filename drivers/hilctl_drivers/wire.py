@@ -5,7 +5,8 @@ Values are in the unit of the output or input, commands in the unit of the actua
 """
 
 from abc import ABC, abstractmethod
-from collections.abc import Callable, Sequence
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import contextmanager
 from typing import Any
 
 import numpy as np
@@ -13,6 +14,7 @@ import numpy as np
 from hilctl.base.types import F64
 from hilctl_drivers.dac_setup import DacSetup
 from hilctl_drivers.session import SensorReader, Session
+from hilctl_drivers.transport.links import CorruptError
 from hilctl_drivers.transport.wire_time import RateLimit
 
 
@@ -88,10 +90,20 @@ class Wire(ABC):
 
         An answer may take ``block_s`` longer than the timeout, if the device's clock sets the pace.
         """
+        with self.opened():
+            self.session.identify()
+            return self.session.old_errors()
+
+    @contextmanager
+    def opened(self) -> Iterator[None]:
+        """Open the link; a device that boots may send text in place of its first replies."""
         if not self.link.is_open:  # another output may have opened it
             self.link.open()
-        self.session.identify()
-        return self.session.old_errors()
+        hint = getattr(self.link, "boot_hint", "")
+        try:
+            yield
+        except CorruptError as error:
+            raise CorruptError(f"{error}{hint}") from None
 
     def recover(self) -> None:
         """Clean up after an earlier run, so that the device accepts its init steps."""

@@ -100,9 +100,9 @@ class BoardWire(Wire):
     def open(self, block_s: float = 0.0) -> list[str]:
         """Connect and check that the board matches this profile."""
         self.link.set_timeout(self.setup.writer.timeout_s + block_s)
-        self.link.open()
-        self.session.restart()
-        self._facts = facts = self.session.facts()
+        with self.opened():
+            self.session.restart()
+            self._facts = facts = self.session.facts()
         low, high = self.setup.output.limits
         slack = 1e-6 * (high - low)
         if low < facts.low - slack or high > facts.high + slack:

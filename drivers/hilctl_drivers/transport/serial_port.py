@@ -130,7 +130,7 @@ class SerialLink(StreamLink):
             self._exclusive = refuse_to_others(self._fd, file)
             self._stale = True
             boot_wait_s = self._settings.boot_wait_s
-            self._silent_hint = (
+            self.boot_hint = (
                 "; if opening the port resets the device, set boot_wait_s to the time until it "
                 f"answers (now {boot_wait_s:g} s)"
             )

@@ -85,7 +85,8 @@ class StreamLink(ABC):
         self._stale = True
         self._quiet_at = 0.0
         self._looked_ns = 0
-        self._silent_hint = ""  # why there may be no answer; empty after the first one
+        self.boot_hint = ""
+        """Why there may be no answer, or no good one; empty after the first one."""
 
     def set_timeout(self, timeout_s: float) -> None:
         """Set the longest time of one exchange, s."""
@@ -154,7 +155,7 @@ class StreamLink(ABC):
                 reply = self._complete(request, bytearray(), missing, deadline)
         except (OSError, DeviceError) as error:
             raise self._failed(error) from None
-        self._silent_hint = "" if reply else self._silent_hint
+        self.boot_hint = "" if reply else self.boot_hint
         if self._gap_s:
             self._quiet_at = self._clock() + self._gap_s
         return reply[len(request) :] if self._echo else reply
@@ -244,7 +245,7 @@ class StreamLink(ABC):
         while wanted := missing(reply):
             if late or not self._poll.poll(wait_ms(deadline, self._clock())):
                 only_echo = reply.startswith(request) and not self._echo
-                hint = f": {ECHOED}" if only_echo else self._silent_hint
+                hint = f": {ECHOED}" if only_echo else self.boot_hint
                 raise NoAnswerError(cut(len(reply), wanted, self.timeout_s) + hint)
             late = self._clock() > deadline
             reply += self._read()

@@ -9,8 +9,9 @@ from unittest.mock import Mock
 
 import pytest
 
-from hilctl.base.errors import InputError
-from hilctl_drivers.profile import load_profile, with_link
+from hilctl.base.errors import DeviceError, InputError
+from hilctl_drivers.dac import SerialDac, SerialOptions
+from hilctl_drivers.profile import load_profile, shipped_profiles, with_link
 from hilctl_drivers.transport import stream_link
 from hilctl_drivers.transport.links import LostError, NoAnswerError
 from hilctl_drivers.transport.serial_port import SerialLink
@@ -245,3 +246,19 @@ def test_first_silence_after_opening_may_be_a_boot(line):
     link.timeout_s = QUICK_S
     assert "boot_wait_s" not in silence()
     link.close()
+
+
+@pytest.mark.parametrize("chatter", [b"", b"ets Jun  8 2016\r\n\x00\r\nready\r\n"])
+def test_a_board_that_boots_when_the_port_opens_names_the_key(tmp_path, line, chatter):
+    master, port = line
+    text = shipped_profiles()["cobs_board"].read_text()
+    profile = tmp_path / "board.yaml"
+    profile.write_text(text.replace("boot_wait_s: 2.0", "boot_wait_s: 0.0"))
+    options = {
+        "profile": str(profile), "serial_port": port, "output": "DAC", "input": "ADC",
+        "amplifier": {"gain_a_per_v": 1.0}, "sensor": {"um_per_v": 1.0}, "watchdog": "none",
+        "timeout_s": 0.3,
+    }  # fmt: skip
+    device = SerialDac(SerialOptions.model_validate(options))
+    with answering(master, chatter), pytest.raises(DeviceError, match="boot_wait_s"):
+        device.open(100.0, 1)
