@@ -1,8 +1,8 @@
 """``Dac``: a device with an output, described by a profile; kinds differ in their options only.
 
 A tick is one exchange on the wire, and up to three further requests: to measure the output, for an
-auxiliary channel, and to feed a strict watchdog. No request is sent before the last reply has come,
-and a serial line is drained after a timeout.
+auxiliary channel, and to feed a strict watchdog. No request is sent on a link before the last reply
+has come, and a serial line is drained after a timeout.
 """
 
 import math

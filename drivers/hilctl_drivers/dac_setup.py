@@ -9,7 +9,7 @@ from hilctl.base.device import AuxChannel
 from hilctl.base.errors import InputError
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.profile_base import BaseProfile, Range
-from hilctl_drivers.session import SensorReader, SteppedSession, session_class
+from hilctl_drivers.session import SensorReader, SteppedSession, request_ahead, session_class
 from hilctl_drivers.signal_chain import (
     AuxInput,
     DacOptions,
@@ -161,6 +161,9 @@ class DacSetup:
         both = read.then(wire)
         if self.shares_link:
             return both
+        if request_ahead(self.reader, self.input):
+            shorter, longer = sorted((read, wire), key=lambda each: each.total_s)
+            return longer.named(f"with {shorter.what} at the same time")
         # Of two links, one is silent before its next request while the other is at work.
         silent_s = (
             min(self.reader.profile.link.silence_s, wire.total_s),

@@ -14,6 +14,7 @@ from hilctl.base.errors import DeviceError
 from hilctl_drivers.endpoint import Endpoint
 from hilctl_drivers.profile_base import Range
 from hilctl_drivers.transport.links import ErrorPrefix, Link
+from hilctl_drivers.transport.stream_link import StreamLink
 from hilctl_drivers.transport.wire_time import WireTime
 
 
@@ -44,6 +45,11 @@ class Session(ABC):
     @abstractmethod
     def read_time(profile: Any, source: Any) -> WireTime:
         """Return the time of reading an input."""
+
+    @staticmethod
+    def request(device: Endpoint, source: Any) -> bytes:
+        """Return the first request of a reading; empty if its bytes differ from time to time."""
+        return b""
 
     @abstractmethod
     def identify(self) -> None:
@@ -128,6 +134,11 @@ def session_class(device: Endpoint) -> type[Session]:
     return cast("type[Session]", resolve_name(device.profile.SESSION))
 
 
+def request_ahead(device: Endpoint, source: Range) -> bytes:
+    """Return the request of a reading that can be sent before another exchange; empty if none."""
+    return b"" if device.framing == "tcp" else session_class(device).request(device, source)
+
+
 class SensorReader:
     """Reader of an input.
 
@@ -150,6 +161,7 @@ class SensorReader:
         self.link: Link = self._own or link
         self.session: Session = session_class(device).on(device, self.link)
         self._read = self.session.input_reader(source)
+        self._request = request_ahead(device, source) if own else b""
 
     def open(self) -> None:
         """Connect and identify the device."""
@@ -170,6 +182,21 @@ class SensorReader:
         """Return the value of the input in its unit."""
         with ErrorPrefix(self._name):
             return self._read()
+
+    def read_while(self, write: Callable[[], object]) -> float:
+        """Return :meth:`read`, and write the output.
+
+        On a link of its own, the device answers while ``write`` waits for another one. Otherwise
+        the reading comes first.
+        """
+        if not self._request:
+            found = self.read()
+            write()
+            return found
+        with ErrorPrefix(self._name):
+            cast(StreamLink, self.link).begin(self._request)
+        write()
+        return self.read()
 
     def end(self) -> None:
         """Run the close steps."""

@@ -321,3 +321,99 @@ def test_frames_over_tcp_with_datagrams(stack, tmp_path):
     reads(made, 0, -2.5, -25.0)
     made.make_safe(0.0)
     assert volts == [0.0]
+
+
+GAUGE = """\
+vendor: nobody
+model: a gauge
+source: [this test]
+verified: "yes"
+link: {kind: ascii, baud: 115200, terminator: "\\r", reply_terminator: "\\r"}
+address: none
+outputs: {}
+inputs:
+  gauge: {ask: "R", pattern: "{value}", example: "1.5", unit: um, min: -125, max: 125}
+exchange: none
+turnaround_s: 0.0
+max_rate_hz: 1000.0
+watchdog: none
+"""
+
+
+class Gauge(Peer):
+    """A sensor that answers its first request at once, and others when ``command`` is set."""
+
+    def __init__(self, fd, command):
+        super().__init__(fd)
+        self._command = command
+
+    def answer(self, received):
+        *lines, rest = received.split(b"\r")
+        for line in lines:
+            assert line == b"R"
+            self.got.append(line)
+            if len(self.got) > 1 and not self._command.wait(TIMEOUT_S):
+                continue
+            self._command.clear()
+            self.say(b"%.1f\r" % len(self.got))
+        return rest
+
+
+class Supply(XorFrames):
+    """The controller with exclusive or, which notes each command."""
+
+    def __init__(self, fd, command):
+        super().__init__(fd, [0.0])
+        self._command = command
+
+    def answer(self, received):
+        rest = super().answer(received)
+        if self.got[-1][2] == 1:
+            self._command.set()
+        return rest
+
+
+@pytest.fixture
+def on_two_links(stack, line, tmp_path):
+    """Return a device whose sensor answers no reading before the output has its command."""
+    for name, text in (("xor", XOR), ("gauge", GAUGE)):
+        (tmp_path / f"{name}.yaml").write_text(text)
+    server = stack.enter_context(socket.create_server(("127.0.0.1", 0)))
+    command, peers = threading.Event(), []
+    gauge, port = line(Gauge, command)
+
+    def accept():
+        with suppress(OSError):
+            while True:
+                peers.append(Supply(server.accept()[0].detach(), command).start())
+
+    threading.Thread(target=accept, daemon=True).start()
+    stack.callback(lambda: [each.close() for each in peers])
+    made = device(
+        stack, profile=str(tmp_path / "xor.yaml"), host="127.0.0.1",
+        tcp_port=server.getsockname()[1], output="out", input="gauge",
+        reader={"profile": str(tmp_path / "gauge.yaml"), "serial_port": port},
+    )  # fmt: skip
+    return made, gauge, peers
+
+
+def test_output_and_sensor_on_two_links_are_exchanged_at_the_same_time(on_two_links):
+    made, gauge, peers = on_two_links
+    made.open(10.0, 1)
+    made.arm()
+    for k in range(20):
+        assert exchanged(made, k, 0.1 * k) == 2.0 + k
+    commands = [struct.unpack(">i", each[3:7])[0] for each in peers[0].got if each[2] == 1]
+    assert commands[-20:] == [100_000 * k for k in range(20)]
+    assert len(gauge.got) == 21
+
+
+def test_a_sensor_that_is_silent_keeps_no_safe_value(on_two_links):
+    made, gauge, peers = on_two_links
+    made.open(10.0, 1)
+    made.arm()
+    gauge.say = lambda data: None
+    with pytest.raises(DeviceError, match=r"reader .*gauge.*no answer"):
+        exchanged(made, 0, 5.0)
+    made.make_safe(-1.0)
+    assert peers[-1]._volts == [-1.0]

@@ -202,7 +202,7 @@ class SentBlocks:
         assert before_ns <= at_ns + 1
         assert at_ns <= time.monotonic_ns() + 1
         complete, self._complete = self._complete, bisect_right(self.sent_ns, before_ns) - 2
-        if isinstance(device._reader.link, SerialLink):
+        if isinstance(device.reader.link, SerialLink):
             return min(self.shown_um[max(0, complete) :], key=lambda each: abs(each - read_um))
         number = bisect_right(self.sent_ns, arrived_ns) - 1
         assert number >= complete

@@ -90,6 +90,13 @@ class AsciiSession(SteppedSession):
         return query_time(profile, source).named(f"to {profile.title}")
 
     @staticmethod
+    def request(device: Endpoint, source: AsciiInput) -> bytes:
+        """See :meth:`~hilctl_drivers.session.Session.request`."""
+        profile = cast(AsciiProfile, device.profile)
+        address = profile.unit if device.unit is None else device.unit
+        return formats(profile.link)[0].wire(fill(source.ask, address=address))
+
+    @staticmethod
     def digital_time(profile: AsciiProfile, output: AsciiDigitalOutput) -> WireTime:
         """Return the time to set a digital output, with the longer line."""
         texts = (fill(each, address=profile.unit) for each in (output.high, output.low))

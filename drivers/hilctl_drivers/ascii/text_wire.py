@@ -152,9 +152,7 @@ class TextWire(Wire):
             number = reading(combined, partial(self.session.ask, text))
             found = self._profile.inputs[combined.input].value(number)
         else:
-            # First the reading, which must not show the effect of the command yet.
-            found = self._reader.read()
-            self._write(value)
+            found = self._reader.read_while(partial(self._write, value))
         displacement_um[0] = chain.displacement_um(found)
 
     def read(self) -> float | None:

@@ -6,6 +6,7 @@ and returns their readings. Its clock therefore sets the pace, and the readings 
 longest stall of this machine. The board outputs the first sample when that many blocks are queued.
 """
 
+from functools import partial
 from typing import cast
 
 import numpy as np
@@ -130,14 +131,18 @@ class BoardWire(Wire):
         if self.fifo_depth:
             readings = self._queue(first_sample, values)
         else:
-            # First the reading, which must not show the effect of the command yet.
-            read = None if self._reader is None else self._reader.read()
-            readings = self.session.exchange(values).values
-            if readings.size != 1:
-                raise DeviceError(f"{readings.size} readings received for one sample")
-            readings = readings if read is None else np.array([read])
+            exchange = partial(self._exchange_one, values)
+            reader = self._reader
+            readings = exchange() if reader is None else np.array([reader.read_while(exchange)])
         if readings.size:
             self.setup.chain.fill_um(readings, displacement_um)
+
+    def _exchange_one(self, values: F64) -> F64:
+        """Exchange a sample, and return the reading of the board."""
+        readings = self.session.exchange(values).values
+        if readings.size != 1:
+            raise DeviceError(f"{readings.size} readings received for one sample")
+        return readings
 
     def _queue(self, first_sample: int, values: F64) -> F64:
         """Queue a block and wait for the readings of the block that leaves the FIFO."""

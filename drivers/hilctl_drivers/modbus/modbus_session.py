@@ -175,6 +175,12 @@ class ModbusSession(SteppedSession):
         return TickPlan(profile, inputs=[source]).time
 
     @staticmethod
+    def request(device: Endpoint, source: ModbusInput) -> bytes:
+        """See :meth:`~hilctl_drivers.session.Session.request`; those of Modbus TCP are numbered."""
+        pdu = read_request(cast(ModbusProfile, device.profile), source)
+        return modbus.rtu_adu(device.unit or 0, pdu) if device.framing == "rtu" else b""
+
+    @staticmethod
     def digital_time(profile: ModbusProfile, output: DigitalRegister) -> WireTime:
         """See :meth:`~hilctl_drivers.session.SteppedSession.digital_time`."""
         return requests_time(profile, [write_request(profile, output)])

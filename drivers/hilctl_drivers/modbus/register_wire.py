@@ -3,12 +3,13 @@
 The profile describes the registers, the experiment their wiring. A sample is one transaction if the
 device can read and write in one (function 23, or 76 on LabJack's), otherwise a read and a write;
 another device, of any protocol, may have the input. Several outputs of one device are exchanged in
-the same requests as far as their registers allow. No request is repeated, and none precedes the
-last reply.
+the same requests as far as their registers allow. No request is repeated, and on a link none
+precedes the last reply.
 """
 
 from collections.abc import Callable, Sequence
 from dataclasses import replace
+from functools import partial
 from typing import Any, cast
 
 import numpy as np
@@ -180,7 +181,7 @@ class RegisterExchange(JointWire):
         self._best = self._planned(combine=all(each.reads_output for each in wires))
         self._plan = self._best  # as far as is known; opening it shows
         self._tick: Tick
-        self._elsewhere: list[Callable[[], float] | None] = []
+        self._elsewhere: list[SensorReader | None] = []
 
     def _planned(self, *, combine: bool) -> TickPlan:
         setups = [each.setup for each in self._registers]
@@ -220,7 +221,7 @@ class RegisterExchange(JointWire):
             wire.take_aux()
             wire.try_out_safe_value()
         self._elsewhere = [
-            reader.read if wire.setup.reads_elsewhere else None
+            reader if wire.setup.reads_elsewhere else None
             for wire, reader in zip(wires, readers, strict=True)
         ]
         self.requests = len(self._plan.requests)
@@ -258,8 +259,16 @@ class RegisterExchange(JointWire):
         """See :meth:`~hilctl_drivers.wire.JointWire.exchange`."""
         wires = self._registers
         data = [wire.encoded(each) for wire, each in zip(wires, commands, strict=True)]
-        readings = [None if read is None else read() for read in self._elsewhere]
-        self._tick.run(data)
+        readings: list[float | None] = [None] * len(wires)
+
+        def read_while(k: int, reader: SensorReader, exchange: Callable[[], object]) -> None:
+            readings[k] = reader.read_while(exchange)
+
+        exchange: Callable[[], object] = partial(self._tick.run, data)
+        for k, reader in enumerate(self._elsewhere):
+            if reader is not None:
+                exchange = partial(read_while, k, reader, exchange)
+        exchange()
         for wire, reading, displacement_um in zip(wires, readings, displacements_um, strict=True):
             wire.take(reading, displacement_um)
 

@@ -83,7 +83,8 @@ class StreamLink(ABC):
         self._waiting = array.array("i", [0])
         self._count_waiting: Callable[[], object] = lambda: None
         self._stale = True
-        self._quiet_at = 0.0
+        self._quiet_at = self._deadline = 0.0
+        self._begun: bytes | bytearray = b""
         self._looked_ns = 0
         self.boot_hint = ""
         """Why there may be no answer, or no good one; empty after the first one."""
@@ -121,6 +122,7 @@ class StreamLink(ABC):
         self._poll = select.poll()
         self._poll.register(fd, select.POLLIN)
         self._looked_ns = time.monotonic_ns()
+        self._begun = b""
 
     def transact(
         self, request: bytes | bytearray, missing: Missing, usual: int = 0
@@ -135,30 +137,50 @@ class StreamLink(ABC):
             missing, usual = _behind(request, missing), 0
         reply: bytes | bytearray
         try:
-            self._count_waiting()
-            if self._waiting[0] or self._gap_s or self._stale:
-                self._settle()
-            deadline = self._clock() + self.timeout_s
-            # Past pyserial, which takes three times as long; its flush() hangs on ptys and USB CDC.
-            try:
-                sent = write(self._fd, request)
-            except BlockingIOError:
-                sent = 0
-            if sent < len(request):
-                self._send(request[sent:])
-                usual = 0  # that took a part of the time-out
-            if usual and self._poll.poll(self._timeout_ms):
+            if self._begun != request:
+                self._stale |= bool(self._begun)
+                whole = self._put(request)
+            else:
+                whole = False
+            self._begun = b""
+            # Otherwise a part of the time-out has passed.
+            if whole and usual and self._poll.poll(self._timeout_ms):
                 reply = read(self._fd, _FIRST)
                 if len(reply) != usual:
-                    reply = self._complete(request, bytearray(reply), missing, deadline)
+                    reply = self._complete(request, bytearray(reply), missing)
             else:
-                reply = self._complete(request, bytearray(), missing, deadline)
+                reply = self._complete(request, bytearray(), missing)
         except (OSError, DeviceError) as error:
             raise self._failed(error) from None
         self.boot_hint = "" if reply else self.boot_hint
         if self._gap_s:
             self._quiet_at = self._clock() + self._gap_s
         return reply[len(request) :] if self._echo else reply
+
+    def begin(self, request: bytes | bytearray) -> None:
+        """Send the request of the next exchange; :meth:`transact` then awaits the reply to it."""
+        if self._fd < 0:
+            raise LostError("not open")
+        try:
+            self._put(request)
+        except (OSError, DeviceError) as error:
+            raise self._failed(error) from None
+        self._begun = request
+
+    def _put(self, request: bytes | bytearray) -> bool:
+        """Send a request when the line is silent; return whether that took no time."""
+        self._count_waiting()
+        if self._waiting[0] or self._gap_s or self._stale:
+            self._settle()
+        self._deadline = self._clock() + self.timeout_s
+        # Past pyserial, which takes three times as long; its flush() hangs on ptys and USB CDC.
+        try:
+            sent = write(self._fd, request)
+        except BlockingIOError:
+            sent = 0
+        if sent < len(request):
+            self._send(request[sent:])
+        return sent == len(request)
 
     def wait(self, wait_s: float) -> bool:
         """Wait for unsolicited data; return whether any has arrived."""
@@ -239,9 +261,9 @@ class StreamLink(ABC):
             self._sleep(early_s)
 
     def _complete(
-        self, request: bytes | bytearray, reply: bytearray, missing: Missing, deadline: float
+        self, request: bytes | bytearray, reply: bytearray, missing: Missing
     ) -> bytearray:
-        late = False
+        late, deadline = False, self._deadline
         while wanted := missing(reply):
             if late or not self._poll.poll(wait_ms(deadline, self._clock())):
                 only_echo = reply.startswith(request) and not self._echo

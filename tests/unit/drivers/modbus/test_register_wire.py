@@ -462,12 +462,15 @@ class TestPlaces:
         with pytest.raises(InputError, match=r"baud must be .*M-7024.*, got 14400"):
             placed(baud=14400)
 
-    def test_two_lines_are_silent_at_the_same_time(self):
-        info = placed(reader={**PAIR["reader"], "serial_port": "/dev/y"}).info
-        total_s = 31 * 10 / 9600 + 2 * 3.5 * 10 / 9600 + 2 * 0.002 + SETTLE_S
-        assert info.max_rate_hz == pytest.approx(1.0 / total_s)
-        faster = placed(reader={**PAIR["reader"], "serial_port": "/dev/y", "baud": 115200}).info
-        assert faster.rate_note.startswith("FC04 at 115200 8N1, then FC06 at 9600 8N1")
+    @pytest.mark.parametrize(("baud", "slower"), [(115200, "FC06 at 9600"), (1200, "FC04 at 1200")])
+    def test_the_slower_of_two_lines_sets_the_rate(self, baud, slower):
+        """A write of 16 characters with settling, and a read of 15, each with two gaps."""
+        reader = {**PAIR["reader"], "serial_port": "/dev/y", "baud": baud}
+        info = placed(reader=reader, timeout_s=1.0).info
+        write_s = 16 * 10 / 9600 + 2 * 3.5 * 10 / 9600 + 0.002 + SETTLE_S
+        read_s = 15 * 10 / baud + 2 * max(3.5 * 10 / baud, 1.75e-3) + 0.002
+        assert info.max_rate_hz == pytest.approx(1.0 / max(read_s, write_s))
+        assert info.rate_note.startswith(f"{slower} 8N1 with FC0")
 
     def test_a_place_named_twice_is_one_line(self, tmp_path):
         (tmp_path / "port").touch()
