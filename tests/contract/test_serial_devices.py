@@ -32,6 +32,7 @@ SERIAL = (
 PIEZO = (
     "pi_e709 V",
     "pi_e727 V",
+    "pi_e727_3cd V",
     "npoint_lc400 V",
     "thorlabs_kpz101 thorlabs_ksg101 own V",
     "cobs_board V",

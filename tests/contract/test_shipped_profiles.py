@@ -18,7 +18,7 @@ NAMES = (
     "capancdt_6200", "cobs_board", "cobs_board_fifo", "generic_float32", "icp_et7000", "icp_m7017",
     "icp_m7024", "icp_m7024_dcon", "kepco_bop", "keyence_cl3000", "labjack_t4", "labjack_t7",
     "labjack_t8", "magna_power_sl", "moxa_iologik_e1240", "npoint_lc400", "optoncdt_1420",
-    "pi_e709", "pi_e727", "tdk_lambda_gen", "thorlabs_kpz101", "thorlabs_ksg101",
+    "pi_e709", "pi_e727", "pi_e727_3cd", "tdk_lambda_gen", "thorlabs_kpz101", "thorlabs_ksg101",
     "thorlabs_mdt693b", "wago_750", "waveshare_ai_8ch", "waveshare_ai_8ch_b", "waveshare_ao_8ch",
     "waveshare_ao_8ch_b",
 )  # fmt: skip

@@ -297,10 +297,15 @@ class AsciiOutput(ScaledRange):
     readback: Readback | Literal["none"] = Field(
         default="none", description="query of the applied value, to confirm the safe value"
     )
+    argument: LineTemplate | None = Field(
+        default=None, description="its argument in joint.write, such as 1 {value:.4f}"
+    )
 
     @model_validator(mode="after")
     def _has_value(self) -> Self:
         self.check_write("write", self.write)
+        if self.argument is not None:
+            self.check_write("argument", self.argument)
         return self
 
     def check_write(self, key: str, template: str) -> None:
@@ -345,6 +350,9 @@ class AsciiInput(ScaledRange, Query, MeasuredReply):
     measures: Literal["terminal", "output"] = Field(
         default="terminal", description="terminal: what is wired to it; output: its own output"
     )
+    argument: LineTemplate | None = Field(
+        default=None, description="its argument in joint.ask; the reply has a line like its own"
+    )
 
 
 class AsciiDigitalOutput(StrictModel):
@@ -379,6 +387,13 @@ class AsciiExchange(MeasuredReply):
     write: LineTemplate = Field(
         description="line or lines that are sent, with {value}, the number of the output"
     )
+
+
+class AsciiJoint(StrictModel):
+    """A query and a command for several channels; the argument of each follows after a blank."""
+
+    ask: LineTemplate = Field(description="query of several inputs, such as POS?")
+    write: LineTemplate = Field(description="command that sets several outputs, such as SVA")
 
 
 class SendStep(StrictModel):
@@ -463,6 +478,11 @@ class AsciiProfile(BaseProfile):
         description="lines that write and read in one transaction, unless another device or"
         " another input reads the sensor; none if there are none"
     )
+    joint: AsciiJoint | Literal["none"] = Field(
+        default="none",
+        description="lines that read several inputs and set several outputs at once, for the axes"
+        " of one run; each channel has an argument; none if there are none",
+    )
     digital_outputs: dict[Name, AsciiDigitalOutput] = Field(
         default={}, description="digital outputs by name, for pulses at marks of the waveform"
     )
@@ -483,6 +503,12 @@ class AsciiProfile(BaseProfile):
     selftest: Check | Literal["none"] = Field(
         default="none", description="query that identifies the device"
     )
+
+    @model_validator(mode="after")
+    def _joint_is_one_write(self) -> Self:
+        if self.joint != "none" and self.link.silence_s:
+            raise ValueError("joint must be none if min_gap_s separates commands")
+        return self
 
     @model_validator(mode="after")
     def _exchange_channels(self) -> Self:

@@ -100,7 +100,7 @@ class AsciiSession(SteppedSession):
     def digital_time(profile: AsciiProfile, output: AsciiDigitalOutput) -> WireTime:
         """Return the time to set a digital output, with the longer line."""
         texts = (fill(each, address=profile.unit) for each in (output.high, output.low))
-        return _lines_time(profile, [(max(texts, key=len), _example(output.reply))])
+        return lines_time(profile, [(max(texts, key=len), _example(output.reply))])
 
     @staticmethod
     def steps_time(profile: AsciiProfile, steps: Sequence[AsciiStep]) -> WireTime:
@@ -115,14 +115,14 @@ class AsciiSession(SteppedSession):
             elif isinstance(step, SendStep):
                 lines.append((fill(step.text, **values), _example(step.reply)))
         waits_s = [step.seconds for step in steps if isinstance(step, WaitStep)]
-        return _lines_time(profile, lines).waiting(waits_s)
+        return lines_time(profile, lines).waiting(waits_s)
 
     @classmethod
     def arm_s(cls, profile: AsciiProfile, output: str) -> float:
         """Return the time with a query of errors, see :class:`SteppedSession`."""
         query, error_s = profile.error_query, 0.0
         if query != "none" and profile.watchdog != "none":
-            error_s = _lines_time(profile, [(query.ask, query.example)]).answered_s
+            error_s = lines_time(profile, [(query.ask, query.example)]).answered_s
         return super().arm_s(profile, output) + error_s
 
     def text(self, template: str, **values: float) -> str:
@@ -351,16 +351,16 @@ def exchange_time(profile: AsciiProfile, output: str, sensor: str | None) -> Wir
 
     settle_s = channel.settle_s + (profile.inputs[sensor].settle_s if sensor else 0.0)
     if combined != "none" and (combined.output, combined.input) == (output, sensor):
-        return _lines_time(profile, [(longest(combined.write), combined.example)], settle_s)
+        return lines_time(profile, [(longest(combined.write), combined.example)], settle_s)
     lines = [(longest(channel.write), _example(channel.reply))]
     if sensor is not None:
         lines.append(_question(profile, profile.inputs[sensor]))
-    return _lines_time(profile, lines, settle_s)
+    return lines_time(profile, lines, settle_s)
 
 
 def query_time(profile: AsciiProfile, query: AsciiInput) -> WireTime:
     """Return the time of a query in addition to the exchange."""
-    return _lines_time(profile, [_question(profile, query)], query.settle_s)
+    return lines_time(profile, [_question(profile, query)], query.settle_s)
 
 
 def _example(reply: Reply | Literal["none"]) -> str | None:
@@ -371,7 +371,7 @@ def _question(profile: AsciiProfile, query: Query) -> _Line:
     return fill(query.ask, address=profile.unit), query.example
 
 
-def _lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float = 0.0) -> WireTime:
+def lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float = 0.0) -> WireTime:
     """Return the time of lines with their replies, one after the other."""
     requests, answers = formats(profile.link)
     replies = [reply for _, reply in lines if reply is not None]

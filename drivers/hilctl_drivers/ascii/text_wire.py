@@ -4,7 +4,7 @@ A sample is one request and its reply, or two if writing and reading are separat
 """
 
 import re
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from functools import partial
 from string import Formatter
 from typing import cast
@@ -13,12 +13,17 @@ from hilctl.base.errors import UnconfirmedError
 from hilctl.base.types import F64
 from hilctl_drivers.ascii.ascii_profile import (
     AsciiExchange,
+    AsciiInput,
+    AsciiJoint,
     AsciiOutput,
     Readback,
+    Reply,
+    pattern_of,
 )
 from hilctl_drivers.ascii.ascii_session import (
     AsciiSession,
     exchange_time,
+    lines_time,
     query_time,
     reading,
 )
@@ -28,7 +33,7 @@ from hilctl_drivers.session import SensorReader
 from hilctl_drivers.transport.links import Link, WatchdogTrippedError
 from hilctl_drivers.transport.safe_exchange import check_read_back, try_out
 from hilctl_drivers.transport.wire_time import RateLimit, WireTime
-from hilctl_drivers.wire import HostWatchdog, Wire
+from hilctl_drivers.wire import HostWatchdog, JointWire, Wire
 
 _NO_EVIDENCE = (
     "the device cannot confirm it: it sends no reply, or repeats the request, and its profile "
@@ -101,7 +106,7 @@ class TextWire(Wire):
         super().__init__(setup, link)
         self.session = AsciiSession.on(setup.writer, link)
         self._profile = profile = self.session.profile
-        self._target = target = cast(AsciiOutput, setup.output)
+        self.target = target = cast(AsciiOutput, setup.output)
         self.watchdog: TextWatchdog = TextWatchdog(setup, self.session, self._write, self.confirm)
         options, combined = setup.options, profile.exchange
         own = None if setup.reads_elsewhere else (options.output, options.input)
@@ -122,6 +127,15 @@ class TextWire(Wire):
             busy = setup.after_reading(busy)
         self.longest_message_s = busy.answered_s + write.answered_s
         self.unconfirmed = self._unconfirmed()
+
+    def joint(self, wires: Sequence[Wire]) -> JointWire | None:
+        """See :meth:`~hilctl_drivers.wire.Wire.joint`."""
+        texts = cast("Sequence[TextWire]", wires)
+        lines, own = self._profile.joint, all(not each.setup.reads_elsewhere for each in wires)
+        channels = [(each.target, cast(AsciiInput, each.setup.input)) for each in texts]
+        known = all(None not in (output.argument, source.argument) for output, source in channels)
+        valid = all(source.invalid == "none" for _, source in channels)
+        return TextExchange(texts, lines) if lines != "none" and own and known and valid else None
 
     def rates(self, block: int) -> RateLimit:
         """See :meth:`~hilctl_drivers.wire.Wire.rates`."""
@@ -148,7 +162,7 @@ class TextWire(Wire):
         chain, combined = self.setup.chain, self._combined
         value = chain.output(command.item())
         if combined is not None:
-            text = self.session.text(combined.write, value=self._target.number(value))
+            text = self.session.text(combined.write, value=self.target.number(value))
             number = reading(combined, partial(self.session.ask, text))
             found = self._profile.inputs[combined.input].value(number)
         else:
@@ -159,31 +173,31 @@ class TextWire(Wire):
         """See :meth:`~hilctl_drivers.wire.Wire.read`."""
         if self._readback is None:
             return None
-        return self._target.value(self.session.number(self._readback))
+        return self.target.value(self.session.number(self._readback))
 
     def look(self, reader: SensorReader) -> tuple[float, float | None]:
         """See :meth:`~hilctl_drivers.wire.Wire.look`."""
         found, output = reader.read(), self._measured_output()
         # A wrong query must be detected here, because a run sends these last.
-        if self._target.readback != "none":
-            self.session.number(self._target.readback)
+        if self.target.readback != "none":
+            self.session.number(self.target.readback)
         self.session.check_errors()
         return found, output
 
     def _measured_output(self) -> float | None:
         """Return the output as measured or reported by the device, tripped or not."""
-        unit = self._target.unit
+        unit = self.target.unit
         for source in self._profile.inputs.values():
             if source.measures == "output" and source.unit == unit:
                 return self.session.value(source)
-        readback = self._target.readback
+        readback = self.target.readback
         if readback != "none" and readback.of == "command" and self.watchdog.tripped():
             return None
         return self.read()
 
     def _write(self, value: float) -> bool:
         """Write the output; return whether the reply proves that a device has received it."""
-        text, reply = self._command(value), self._target.reply
+        text, reply = self._command(value), self.target.reply
         if reply == "none":
             self.session.send(text)
             return False
@@ -191,7 +205,7 @@ class TextWire(Wire):
         return self.session.ask(text, reply).string != text
 
     def _command(self, value: float) -> str:
-        return self.session.text(self._target.write, value=self._target.number(value))
+        return self.session.text(self.target.write, value=self.target.number(value))
 
     def message(self, value: float) -> bytes:
         """See :meth:`~hilctl_drivers.wire.Wire.message`."""
@@ -205,7 +219,7 @@ class TextWire(Wire):
             self.watchdog.clear()
             answered = self._write(value)
         # A command without a reply may have been ignored.
-        output, readback = self._target, self._target.readback
+        output, readback = self.target, self.target.readback
         if readback != "none":
             found = output.value(self.session.number(readback))
             check_read_back(output, value, found, 2.0 * output.step)
@@ -224,24 +238,24 @@ class TextWire(Wire):
         value = self.read()
         if value is None:
             return
-        fields = Formatter().parse(self._target.write)
+        fields = Formatter().parse(self.target.write)
         form = number_format(next(spec or "" for _, field, spec, _ in fields if field == "value"))
-        if self._target.value(form.number(form.text(self._target.number(value)))) != value:
+        if self.target.value(form.number(form.text(self.target.number(value)))) != value:
             return
 
         def put() -> None:
             self._write(value)
             self.session.check_errors()
 
-        try_out(self._target, value, put, f"with {self._command(value)}")
+        try_out(self.target, value, put, f"with {self._command(value)}")
 
     def _unconfirmed(self) -> str:
         """Return why a value cannot be confirmed; empty if it can."""
-        reply = self._target.reply
-        if self._target.readback != "none" or self._profile.error_query != "none":
+        reply = self.target.reply
+        if self.target.readback != "none" or self._profile.error_query != "none":
             return ""
         if reply == "none" or _without_numbers(reply.example) == _without_numbers(
-            self._command(self._target.min)
+            self._command(self.target.min)
         ):
             return _NO_EVIDENCE
         return ""
@@ -249,3 +263,61 @@ class TextWire(Wire):
 
 def _without_numbers(text: str) -> str:
     return re.sub(r"[-+.\d]+", "#", text)
+
+
+class TextExchange(JointWire):
+    """One message that reads the inputs of several axes, and then sets their outputs."""
+
+    def __init__(self, wires: Sequence[TextWire], lines: AsciiJoint) -> None:
+        super().__init__(wires)
+        first, outputs = wires[0], [each.target for each in wires]
+        self._session, self._setup, self._outputs = first.session, first.setup, outputs
+        self._inputs = [cast(AsciiInput, each.setup.input) for each in wires]
+        arguments = (each.argument or "" for each in self._inputs)
+        self._before = self._text(lines.ask, *arguments) + "\n" + self._text(lines.write)
+        # GCS ends all lines of a reply but the last one by a blank and a line feed.
+        self._reply = Reply(
+            pattern=" ?\n".join(each.pattern for each in self._inputs),
+            example=" \n".join(each.example for each in self._inputs),
+        )
+
+    def _text(self, *templates: str) -> str:
+        return " ".join(self._session.text(each) for each in templates)
+
+    def _request(self, values: Sequence[float]) -> str:
+        arguments = [
+            self._session.text(each.argument or "", value=each.number(value))
+            for each, value in zip(self._outputs, values, strict=True)
+        ]
+        return " ".join((self._before, *arguments))
+
+    def rates(self, block: int) -> RateLimit:
+        """See :meth:`~hilctl_drivers.wire.JointWire.rates`."""
+        ends = (self._request([each.limits[k] for each in self._outputs]) for k in (0, 1))
+        profile = self._session.profile
+        settle_s = max(each.settle_s for each in self._outputs)
+        settle_s += max(each.settle_s for each in self._inputs)
+        wire = lines_time(profile, [(max(ends, key=len), self._reply.example)], settle_s)
+        for k, each in enumerate(self.wires):
+            wire = each.setup.after_reading(wire, digital=k == 0)
+            if each.setup.measure is not None:
+                measure = query_time(profile, each.setup.measure)
+                wire = wire.then(measure.named("to measure an output"))
+        return self._setup.rates(wire.then(self._setup.feed_time))
+
+    def start(self, readers: Sequence[SensorReader], sample_rate_hz: float, block: int) -> None:
+        """See :meth:`~hilctl_drivers.wire.JointWire.start`."""
+        self.requests = 1 + sum(each.setup.measure is not None for each in self.wires)
+
+    def exchange(
+        self, first_sample: int, commands: Sequence[F64], displacements_um: Sequence[F64]
+    ) -> None:
+        """See :meth:`~hilctl_drivers.wire.JointWire.exchange`."""
+        chains = [each.setup.chain for each in self.wires]
+        values = [chain.output(each.item()) for chain, each in zip(chains, commands, strict=True)]
+        found = self._session.ask(self._request(values), self._reply)
+        for chain, source, text, displacement_um in zip(
+            chains, self._inputs, found.groups(), displacements_um, strict=True
+        ):
+            value = source.value(pattern_of(source.pattern)[1].number(text))
+            displacement_um[0] = chain.displacement_um(value)
