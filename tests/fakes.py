@@ -260,6 +260,9 @@ class FakeHost:
 
     unanswered = False
 
+    def exchanging(self, block):
+        self.unanswered = True
+
     def note_safe_write(self, value, unanswered):
         self.safe_writes.append(value)
 

@@ -197,7 +197,7 @@ class AxisChain:
 
     def begin_exchange(self, late_ns: int) -> Block:
         """Write the lateness of an exchange; return the block whose answer it brings."""
-        self.lane.unanswered = True
+        self.lane.exchanging(self.block)
         head, in_flight = self.block.head, self._in_flight
         # The wake-up alone would not show a delay due to the work of this tick.
         head[_LATE_NS] = max(head[_LATE_NS], late_ns)
@@ -291,8 +291,11 @@ class AxisChain:
     def safe_output(self, began_s: float, clock: Callable[[], float]) -> SafeOutput:
         """Return the ramp from the last command to the safe value, which begins at ``began_s``."""
         limits, device = self.limiter.limits, self.device
-        unanswered = self.lane.unanswered and not device.info.simulated
-        goal = SafeGoal(limits.safe, limits.ramp_per_s, self.limiter.last, unanswered)
+        unanswered, last = self.lane.unanswered, self.limiter.last
+        if self._in_flight and not unanswered:  # its exchange had not begun
+            last = self.block.state[-1]
+        unanswered &= not device.info.simulated
+        goal = SafeGoal(limits.safe, limits.ramp_per_s, last, unanswered)
         return SafeOutput(device, goal, began_s, clock, self.lane.note_safe_write)
 
     def pass_on_unanswered(self) -> None:

@@ -101,6 +101,10 @@ class Lane(Protocol):
         """Mark a block as being sent, so that it is never lost."""
         ...
 
+    def exchanging(self, block: Block) -> None:
+        """Note that the exchange of a block begins, and that it is unanswered."""
+        ...
+
     def answered(self, block: Block) -> bool:
         """Pass a block on to be recorded; return False if it was in a spare slot."""
         ...

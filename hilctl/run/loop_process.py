@@ -61,6 +61,7 @@ class RingLane:
     def __init__(self, ring: SampleRing) -> None:
         ring.prepare_blocks()
         self.claim, self.sending, self.answered = ring.claim, ring.sending, ring.answered
+        self.exchanging = ring.exchanging
         self.record_event = ring.page.push_event
         self.note_safe_write = ring.page.note_safe_write
         self._numbers = ring.page.numbers

@@ -67,7 +67,7 @@ class OfflineLane:
         heads = [head.data.cast("B").cast("q") for head in self._room.heads]
         self._blocks = [Block(head, self._room, slot) for slot, head in enumerate(heads)]
         self.claimed = self._first = self._answered = 0
-        self.exchanging = self.unanswered = False
+        self.unanswered = False
         self._on_batch, self._on_event = on_batch, on_event
 
     def claim(self, *, due: bool = True) -> Block:
@@ -75,16 +75,17 @@ class OfflineLane:
         block = self._blocks[self.claimed % len(self._blocks)]
         block.number, block.due = self.claimed if due else -1, due
         self.claimed += 1
-        self.exchanging = False
         return block
 
     def sending(self, block: Block) -> None:
+        """Do nothing: no other process reads the blocks."""
+
+    def exchanging(self, block: Block) -> None:
         """Note that an exchange begins."""
-        self.exchanging = True
+        self.unanswered = True
 
     def answered(self, block: Block) -> bool:
         """Collect a block."""
-        self.exchanging = False
         self._answered = block.number + 1
         if self._answered - self._first == _BLOCKS_A_BATCH:
             self.flush()
@@ -130,7 +131,7 @@ class OfflineHost:
     def check_exchange(self) -> None:
         """Raise TimeoutError if the same exchange was active at the last call."""
         claimed = self.lanes[0].claimed
-        if self._seen == claimed and any(each.exchanging for each in self.lanes):
+        if self._seen == claimed and any(each.unanswered for each in self.lanes):
             # Time passes for the attempts to set the safe value, too.
             self.clock.sleep_until_ns(self.clock.now_ns() + round(PATIENCE_S * 1e9))
             raise TimeoutError(f"it has not returned within {PATIENCE_S:g} s")

@@ -41,7 +41,7 @@ _LINE = 64
 # Plain integers: access to an enumeration's member takes longer than the write.
 _SENT, _HEAD, _TAIL = int(PageField.SENT), int(PageField.HEAD), int(PageField.TAIL)
 _ENDED_AT, _EXCHANGING = int(PageField.ENDED_AT), int(PageField.EXCHANGING)
-_DROPPED = int(PageField.DROPPED)
+_DROPPED, _UNANSWERED = int(PageField.DROPPED), int(PageField.UNANSWERED)
 _SEQUENCE, _FIRST_SAMPLE = int(BlockHeader.SEQUENCE), int(BlockHeader.FIRST_SAMPLE)
 _HEAD_NUMBERS = len(BlockHeader)
 _MAGIC = 0x48494C43_52494E48
@@ -153,28 +153,36 @@ class SampleRing:
 
     def last_command(self) -> float | None:
         """Return the device's last command, or None if its block was in a spare slot."""
-        # With a FIFO it is the end of the first unanswered block.
         sent, head = self.page.get(PageField.SENT), self.page.get(PageField.HEAD)
-        if self.page.get(PageField.ENDED_AT) == 0:
+        ended_at = self.page.get(PageField.ENDED_AT)
+        if ended_at == 0:
             return self.page.get_float(PageField.OUTPUT_AT_START)
+        # The loop died before the exchange of this axis, in that of an earlier one.
+        sent -= self._end_of(sent - 1) > ended_at
+        # With a FIFO it is the end of the first unanswered block.
         number = min(head, sent - 1)
-        slot = number % self.slots
-        first = int(self._area.heads[slot, BlockHeader.FIRST_SAMPLE])
-        if number < 0 or (
-            number == sent - 1 and first + self.block != self.page.get(PageField.ENDED_AT)
-        ):
+        if number < 0 or (number == sent - 1 and self._end_of(number) != ended_at):
             return None
-        return float(self._area.columns[slot, COMMAND, -1])
+        return float(self._area.columns[number % self.slots, COMMAND, -1])
+
+    def _end_of(self, number: int) -> int:
+        """Return the index after the last sample of a block."""
+        return int(self._area.heads[number % self.slots, BlockHeader.FIRST_SAMPLE]) + self.block
 
     def sending(self, block: Block) -> None:
         """Note that a block is about to be sent."""
-        numbers = self._numbers
         if block.number >= 0:
             block.head[_SEQUENCE] = -block.number - 1
             self._publish(self._integers, _SENT, block.number + 1)
-        numbers[_ENDED_AT] = block.head[_FIRST_SAMPLE] + self.block
         # Last: from now on the loop may be silent while it waits for the device.
-        numbers[_EXCHANGING] = 1
+        self._numbers[_EXCHANGING] = 1
+
+    def exchanging(self, block: Block) -> None:
+        """Note that the exchange of a block begins, which follows those of other axes."""
+        numbers = self._numbers
+        if block.due:
+            numbers[_ENDED_AT] = block.head[_FIRST_SAMPLE] + self.block
+        numbers[_UNANSWERED] = 1
 
     def answered(self, block: Block) -> bool:
         """Hand a block to the consumer; return False if it is in a spare slot."""

@@ -124,7 +124,7 @@ def test_a_reading_since_the_last_tick_is_valid_on_a_serial_line(serial_bench):
     options = {**bench.emulator.options, "timeout_s": TIMEOUT_S}
     bench.device = SerialDac(SerialOptions.model_validate(options))
     bench.open()
-    link = bench.device._reader.link
+    link = bench.device.reader.link
     assert link.wait(TIMEOUT_S)
     assert math.isfinite(bench.exchange(0.0)[0])
     bench.emulator.reader.stalled_until_ns = 2**62

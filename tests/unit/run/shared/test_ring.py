@@ -28,6 +28,7 @@ def born(ring, number, *, due=True):
     block.columns[ANSWERS] = block.aux[:] = number
     block.flags[:] = number
     ring.sending(block)
+    ring.exchanging(block)
     return block
 
 
@@ -308,3 +309,19 @@ def test_cursors_are_published_after_their_data(tmp_path, monkeypatch):
         (PageField.CLEANED, 1, 1, 0, 3),
         (PageField.TAIL, 1, 1, 0, 0),
     ]
+
+
+def test_a_block_whose_exchange_has_not_begun_is_no_last_command(tmp_path):
+    """The loop was killed in the exchange of another axis; the block is recovered nevertheless."""
+    ring = make(tmp_path)
+    ring.page.put_float(PageField.OUTPUT_AT_START, 0.5)
+    assert ring.last_command() == 0.5
+    push(ring, 0)
+    block = ring.claim()
+    block.head[BlockHeader.FIRST_SAMPLE], block.command[:] = BLOCK, 1.0
+    ring.sending(block)
+    assert ring.last_command() == 0.0
+    ring.exchanging(block)
+    assert ring.last_command() == 1.0
+    assert ring.page.get(PageField.UNANSWERED) == 1
+    assert ring.unanswered(BLOCK) is not None
