@@ -95,6 +95,22 @@ def test_unconfirmed_safe_value_has_exit_code_3(monkeypatch, hilctl, as_json):
     assert not as_json or json.loads(out)["output_safe"] is False
 
 
+def test_safe_values_of_axes_are_reported_each(monkeypatch, hilctl):
+    put = {
+        "x": SafeResult("one", 0.0, "A", "confirmed", ""),
+        "y": SafeResult("other", 0.0, "A", "unknown", "no answer", guardian_active=True),
+    }
+    monkeypatch.setattr(module, "put_safe", lambda path, settings: put)
+    code, out, err = hilctl("safe", DEMO)
+    assert (code, out[:8], err[:9]) == (3, "x: one: ", "y: other:")
+    found = json.loads(hilctl("safe", DEMO, "--json")[1])
+    assert (found["output_safe"], found["guardian_active"]) == (False, True)
+    assert {name: each["output_state"] for name, each in found["axes"].items()} == {
+        "x": "confirmed",
+        "y": "unknown",
+    }
+
+
 @pytest.mark.parametrize("words", [["--detach", "--live"], ["--watch", "--json"]])
 def test_incompatible_options_are_refused(hilctl, words):
     """The log of a background run must not contain the token of the page."""

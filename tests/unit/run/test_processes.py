@@ -105,11 +105,13 @@ def left(tmp_path):
     """Return a function that leaves a run of a device without supervisor and loop."""
     held = []
 
-    def leave(*, guarded=True, recorded=True, holds=(HOLDS,)):
+    def leave(*, guarded=True, recorded=True, holds=(HOLDS,), others=()):
         with run_folder(
-            "sine", {"": tmp_path / "a.mcap"}, 1.0, holds, [OutputPlace(holds, "DAC0")]
+            "sine", {"": tmp_path / "a.mcap"}, 1.0, holds, [OutputPlace(holds, "DAC0"), *others]
         ) as (folder, own):
-            page = SampleRing.create(folder.ring, slots=4, block=1, state_size=1).page
+            for number in range(len(others), -1, -1):
+                ring = folder.ring_of(number)
+                page = SampleRing.create(ring, slots=4, block=1, state_size=1).page
             page.put(PageField.GO, 1)
             page.put(PageField.UNANSWERED, 1)
             page.put(PageField.RECORDED, recorded)
@@ -209,3 +211,23 @@ def test_dead_guardians_are_started_again_with_the_lock_of_their_run(left, monke
     for each in locks:
         os.close(each)
     assert not dead.alive
+
+
+OTHER = OutputPlace((HOLDS,), "DAC1")
+
+
+def test_a_guardian_is_relieved_only_for_all_of_its_outputs(left):
+    """Nothing else would make the other one safe."""
+    left(others=[OTHER])
+    assert not GuardianRelief([PLACE]).unanswered(PLACE)
+    assert not GuardianRelief([OTHER]).runs
+    assert GuardianRelief([OTHER, PLACE]).unanswered(PLACE)
+
+
+def test_a_write_is_noted_for_its_own_output(left):
+    run, page = left(others=[OTHER])
+    other = SampleRing(run.ring_of(1)).page
+    relief = GuardianRelief([PLACE, OTHER])
+    relief.note_write(OTHER, 0.5)
+    assert (page.last_safe_write(), other.last_safe_write()) == (None, 0.5)
+    assert (relief.unanswered(PLACE), relief.unanswered(OTHER)) == (True, False)

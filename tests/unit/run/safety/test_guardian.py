@@ -9,6 +9,7 @@ import sys
 import threading
 import time
 from contextlib import contextmanager, suppress
+from functools import partial
 from pathlib import Path
 from types import SimpleNamespace
 from unittest.mock import Mock
@@ -625,3 +626,85 @@ def test_failure_of_the_process_is_no_answer_of_the_device(act, error):
     action.result(30.0)
     assert type(error).__name__ in action.failed
     assert not action.result().final
+
+
+class Stage:
+    """Two outputs on lines of their own; ``silent`` keeps that of y waiting."""
+
+    def __init__(self, folder):
+        self.silent, self.errors, self.asked = threading.Event(), {}, {"x": [], "y": []}
+        self.rings, self.axes = {}, []
+        for name in "xy":
+            ring = SampleRing.create(folder / name, slots=4, block=1, state_size=1)
+            ring.page.put_float(PageField.OUTPUT_AT_START, 1.0)
+            device = SimpleNamespace(
+                info=FakeInfo(holds=(name,)),
+                make_safe=partial(self.make_safe, name),
+                close=lambda: None,
+            )
+            self.rings[name] = ring
+            self.axes.append(GuardedAxis(name, device, ring, 0.0, 50.0))
+
+    def make_safe(self, name, value):
+        self.asked[name].append(value)
+        if name == "y":
+            assert self.silent.wait(30.0)
+        if error := self.errors.get(name):
+            raise error
+
+    def act(self):
+        return SafeAction(self.axes, hung=False)
+
+
+@pytest.fixture
+def two(tmp_path):
+    made = Stage(tmp_path)
+    yield made
+    made.silent.set()
+
+
+def await_(reached):
+    deadline_s = time.monotonic() + 30.0
+    while not reached():
+        assert time.monotonic() < deadline_s
+        time.sleep(0.001)
+
+
+def test_a_silent_axis_delays_no_other_and_is_named(two):
+    """A confirmed axis is left alone; all are confirmed only together."""
+    action = two.act()
+    await_(lambda: two.asked["x"].count(0.0))
+    await_(lambda: "x" not in action.result().error)
+    result = action.result()
+    assert (result.output, result.final, "y" in result.error) == ("unknown", False, True)
+    assert len(two.asked["y"]) == 1
+    two.silent.set()
+    assert action.result(30.0) == SafeActionResult(hung=False, output="confirmed")
+    assert [each[-1] for each in two.asked.values()] == [0.0, 0.0]
+    assert two.asked["x"].count(0.0) == 1
+
+
+def test_each_axis_continues_its_own_ramp(two):
+    two.rings["y"].page.note_safe_write(-0.2, True)
+    two.silent.set()
+    action = two.act()
+    await_(lambda: 0.0 in two.asked["x"] and 0.0 in two.asked["y"])
+    assert min(two.asked["y"]) > -0.2
+    assert min(two.asked["x"]) == 0.0
+    await_(lambda: action.result().output == "set")
+    assert "y" in action.result().error
+    action.release_devices()
+
+
+def test_a_line_that_fails_in_this_process_is_retried_alone(two):
+    two.silent.set()
+    two.errors["y"] = KeyError("a bug")
+    action = two.act()
+    await_(lambda: action.is_over)
+    assert "a bug" in action.failed
+    assert action.result().output == "unknown"
+    steps = len(two.asked["x"])
+    two.errors.clear()
+    action.retry_failed()
+    assert action.result(30.0).confirmed
+    assert (action.failed, len(two.asked["x"])) == ("", steps)

@@ -104,3 +104,24 @@ def test_a_file_without_what_is_needed_is_refused(tmp_path, text, words):
     path.write_text(text, encoding="utf-8")
     with pytest.raises(ConfigError, match=words):
         put_safe(path, [])
+
+
+def test_every_axis_is_set(amplifier, experiment, tmp_path):
+    path = tmp_path / "stage.yaml"
+    axes = "axes: {x: {safe: {value: 0.5}}, y: {safe: {value: -0.5}}}"
+    path.write_text(f"device: {{kind: simulated_terfenol}}\n{axes}", encoding="utf-8")
+    found = put_safe(path, [], amplifier.clock, amplifier.sleep)
+    assert {name: (each.output, each.value) for name, each in found.items()} == {
+        "x": ("confirmed", 0.5),
+        "y": ("confirmed", -0.5),
+    }
+    assert sorted(amplifier.asked) == [-0.5, 0.5]
+    assert put_safe(path, ["axis=y"])[""].value == -0.5
+
+
+def test_problems_of_all_axes_are_listed(tmp_path):
+    path = tmp_path / "stage.yaml"
+    path.write_text("axes: {x: {safe: {value: low}}, y: {safe: {value: high}}}", encoding="utf-8")
+    with pytest.raises(ConfigError) as error:
+        put_safe(path, [])
+    assert {each.where.rpartition(", ")[2] for each in error.value.problems} == {"x", "y"}
