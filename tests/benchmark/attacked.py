@@ -3,9 +3,12 @@
 No device here has a watchdog: whatever it was last given stays on the output.
 """
 
+import copy
 import json
+import math
 import os
 import signal
+import string
 import subprocess
 import sys
 import time
@@ -32,6 +35,7 @@ PEAK_A = 5.0
 RAMP_A_PER_S = PEAK_A / RAMP_S
 START_A = 3.0
 """Where a Modbus device's output is before a run, so that it begins with a ramp."""
+SINE_A, SINE_HZ = 4.0, 1.0
 _TOLERANCE_A = 2e-3
 _JITTER_S = 0.01
 EXPERIMENT: dict[str, Any] = {
@@ -39,8 +43,8 @@ EXPERIMENT: dict[str, Any] = {
     "waveform": {
         "kind": "sine",
         "unit": "A",
-        "amplitude": 4.0,
-        "frequency_hz": 1.0,
+        "amplitude": SINE_A,
+        "frequency_hz": SINE_HZ,
         "duration_s": 600.0,
         "soft_start_s": 0.1,
     },
@@ -101,50 +105,68 @@ def make_real_time(pid: int) -> None:
 
 
 class AttackedRun:
-    """A ``hilctl run`` on a device that is emulated for it alone."""
+    """A ``hilctl run`` on devices that are emulated for it alone, one for each wire.
+
+    ``faults`` and the limit ``stroke_um`` are those of the last device. Several wires are the axes
+    ``a``, ``b``, ...
+    """
 
     def __init__(
         self,
         folder: Path,
-        wire: AttackedWire,
+        *wires: AttackedWire,
         timeout_s: float = 1.0,
         faults: tuple[str, ...] = (),
+        stroke_um: float = 120.0,
         environment: dict[str, str] | None = None,
     ) -> None:
         folder.mkdir()
-        self.output = folder / "run.mcap"
-        self._folder, self._wire = folder, wire
+        self._folder, self._wires = folder, wires
+        names = self._names()
+        self.outputs = [folder / (f"run.{name}.mcap" if name else "run.mcap") for name in names]
         self._environment = {**os.environ, "HILCTL_RUNS": str(folder / "runs")}
-        profile, self._log = folder / "profile.yaml", folder / "log.jsonl"
-        profile.write_text(wire.profile, encoding="utf-8")
-        words = ["emulate", str(profile), "--log", str(self._log)]
-        if wire.start_a:
-            words += ["--current-a", str(wire.start_a)]
-        for each in faults:
-            words += ["--fault", each]
-        self.emulator = self.hilctl(*words, stdout=subprocess.PIPE, text=True)
-        make_real_time(self.emulator.pid)  # a busy machine slows no real device
-        assert self.emulator.stdout is not None
-        address = self.emulator.stdout.readline().split()[-1]
-        host, _, port = address.rpartition(":")
-        place = {"host": host, "tcp_port": int(port)} if host else {"serial_port": address}
-        device = {
-            **wire.device,
-            **_DEVICE,
-            **place,
-            "profile": str(profile),
-            "timeout_s": timeout_s,
-        }
+        self.emulators: list[subprocess.Popen[Any]] = []
+        self._rate_hz = 1.0 / sum(1.0 / each.rate_hz for each in wires)  # they are in turn
+        text: dict[str, Any] = {**EXPERIMENT, "sample_rate_hz": math.floor(self._rate_hz)}
+        condition = EXPERIMENT["condition"]
+        frequency_hz = min(condition["frequency_hz"], math.floor(self._rate_hz / 20.0))
+        text["condition"] = {**condition, "frequency_hz": frequency_hz}
+        axes = {}
+        for name, wire in zip(names, wires, strict=True):
+            last = name == names[-1]
+            device = self._emulated(f"device{name}", wire, faults if last else ())
+            safe = {**EXPERIMENT["safe"], "at_start": wire.start_a}
+            limits = {**EXPERIMENT["limits"], "stroke_um": [-120.0, stroke_um if last else 120.0]}
+            device["timeout_s"] = timeout_s
+            axes[name] = {"device": device, "safe": safe, "limits": limits}
+        text |= axes.get("", {"axes": axes})
         experiment = folder / "run.yaml"
-        text = {**EXPERIMENT, "sample_rate_hz": wire.rate_hz, "device": device}
-        text["safe"] = {**EXPERIMENT["safe"], "at_start": wire.start_a}
         experiment.write_text(yaml.safe_dump(text), encoding="utf-8")
         self._environment |= environment or {}
         # Into a file: a guardian that is stopped holds a pipe open.
         self._said = folder / "said.txt"
         with self._said.open("wb") as said:
-            words = ["run", str(experiment), "--output", str(self.output), "--json"]
+            words = ["run", str(experiment), "--output", str(folder / "run.mcap"), "--json"]
             self.process = self.hilctl(*words, stdout=said, stderr=said)
+
+    def _emulated(self, name: str, wire: AttackedWire, faults: tuple[str, ...]) -> dict[str, Any]:
+        """Emulate a device; return its section of the experiment."""
+        profile = self._folder / f"{name}.yaml"
+        profile.write_text(wire.profile, encoding="utf-8")
+        words = ["emulate", str(profile), "--log", str(self._folder / f"{name}.jsonl")]
+        if wire.start_a:
+            words += ["--current-a", str(wire.start_a)]
+        for each in faults:
+            words += ["--fault", each]
+        emulator = self.hilctl(*words, stdout=subprocess.PIPE, text=True)
+        self.emulators.append(emulator)
+        make_real_time(emulator.pid)  # a busy machine slows no real device
+        assert emulator.stdout is not None
+        address = emulator.stdout.readline().split()[-1]
+        host, _, port = address.rpartition(":")
+        place = {"host": host, "tcp_port": int(port)} if host else {"serial_port": address}
+        # Copies: YAML has no name for what stands twice.
+        return copy.deepcopy({**wire.device, **_DEVICE, **place, "profile": str(profile)})
 
     def hilctl(self, *words: str, **options: Any) -> subprocess.Popen[Any]:
         """Start a command of hilctl, for which this run is the only one."""
@@ -182,12 +204,19 @@ class AttackedRun:
         assert self.process.poll() is None, self.said()
         time.sleep(0.001)
 
-    def log(self) -> "DeviceLog":
-        """Return what the device has put out until now."""
-        return DeviceLog.read(self._log, 1.0 / self._wire.rate_hz, self._wire.start_a)
+    def logs(self) -> list["DeviceLog"]:
+        """Return what each device has put out until now."""
+        files = [self._folder / f"device{name}.jsonl" for name in self._names()]
+        return [
+            DeviceLog.read(file, 1.0 / self._rate_hz, wire.start_a)
+            for file, wire in zip(files, self._wires, strict=True)
+        ]
+
+    def _names(self) -> list[str]:
+        return [""] if len(self._wires) == 1 else [*string.ascii_lowercase[: len(self._wires)]]
 
     def processes(self) -> list[int]:
-        """Return all processes that have its environment, except the emulator.
+        """Return all processes that have its environment, except the emulators.
 
         A supervisor starts a new guardian for one that was killed, so they are not known before.
         """
@@ -197,14 +226,14 @@ class AttackedRun:
             with suppress(OSError):
                 if mine in (each / "environ").read_bytes().split(b"\0"):
                     found.append(int(each.name))
-        return [each for each in found if each != self.emulator.pid]
+        return [each for each in found if each not in [one.pid for one in self.emulators]]
 
     def close(self) -> None:
-        for each in [*self.processes(), self.emulator.pid]:
+        for each in [*self.processes(), *(one.pid for one in self.emulators)]:
             with suppress(ProcessLookupError):
                 os.kill(each, signal.SIGKILL)
-        self.process.wait()
-        self.emulator.wait()
+        for process in (self.process, *self.emulators):
+            process.wait()
 
 
 @contextmanager
@@ -269,6 +298,31 @@ class DeviceLog:
         apart_s = np.diff(self.times_ns[first:]) * 1e-9
         allowed_a = RAMP_A_PER_S * (apart_s + self.period_s + _JITTER_S)
         return float((steps_a / allowed_a).max(initial=0.0))
+
+    def apart(self, other: "DeviceLog", due_ns: int) -> float:
+        """Return how far two outputs with one reference come apart from a time on.
+
+        That is their largest difference, over the one at that time and one step of each: of the
+        sine in a sample period, and of the safe ramp between two writes.
+        """
+        logs = self, other
+        times_ns = np.unique(np.concatenate([[due_ns], *(each.times_ns for each in logs)]))
+        times_ns = times_ns[times_ns >= due_ns]
+        values_a = [np.array([each.at(int(time_ns)) for time_ns in times_ns]) for each in logs]
+        differences_a = np.abs(values_a[0] - values_a[1])
+        gaps_s = [each.gaps_s(times_ns) for each in logs]
+        step_a = 2.0 * np.pi * SINE_HZ * SINE_A * self.period_s
+        ramp_a = RAMP_A_PER_S * (np.maximum(*gaps_s) + self.period_s + _JITTER_S)
+        return float((differences_a / (differences_a[0] + step_a + ramp_a)).max())
+
+    def gaps_s(self, times_ns: I64) -> F64:
+        """Return the time between the writes before and after each time; 0 after the last one."""
+        after = np.searchsorted(self.times_ns, times_ns, side="right")
+        inside = (after > 0) & (after < self.times_ns.size)
+        gaps_s = np.zeros(times_ns.size)
+        found = after[inside]
+        gaps_s[inside] = (self.times_ns[found] - self.times_ns[found - 1]) * 1e-9
+        return gaps_s
 
     def lost(self, samples: Samples | None, until_ns: float) -> int:
         """Return how many writes up to a time are not in the recording, in order.

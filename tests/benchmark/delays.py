@@ -56,11 +56,11 @@ def one_late_request(folder: Path, wire: str, chance: random.Random) -> Trial:
     at, kill = chance.randint(FIRST, LAST), chance.random() < 0.5
     what = f"{delay_s:.2f} s at request {at}, loop {'killed' if kill else 'times out'}"
     faults = (f"late:{delay_s:.3f}@{at}",)
-    with attacked_run(folder, WIRES[wire], TIMEOUT_S, faults) as run:
+    with attacked_run(folder, WIRES[wire], timeout_s=TIMEOUT_S, faults=faults) as run:
         writes, changed_s = 0, math.inf
         # Until the late request, or what follows from it, keeps the device waiting.
         while run.process.poll() is None and time.monotonic() - changed_s < QUIET_S:
-            if (size := run.log().times_ns.size) != writes:
+            if (size := run.logs()[0].times_ns.size) != writes:
                 writes, changed_s = size, time.monotonic() if size >= at // 3 else math.inf
             time.sleep(0.002)
         if kill and run.process.poll() is None:
@@ -72,7 +72,7 @@ def one_late_request(folder: Path, wire: str, chance: random.Random) -> Trial:
         run.process.send_signal(signal.SIGTERM)
         said_safe, ended_ns = _said_safe(run)
         time.sleep(delay_s + 0.5)
-        log = run.log()
+        log = run.logs()[0]
         later = log.unsafe()[log.times_ns >= ended_ns].any()
         wrong = bool(later) or abs(log.at(ended_ns)) > 1e-2
     return Trial(f"{wire}: late", what, said_safe, wrong, 0.0)
@@ -81,19 +81,19 @@ def one_late_request(folder: Path, wire: str, chance: random.Random) -> Trial:
 def link_down(folder: Path, wire: str, chance: random.Random, longest_s: float) -> Trial:
     """Kill the loop, with a device that answers nothing for a while; what it was sent waits."""
     down_s = math.exp(chance.uniform(0.0, math.log(longest_s)))
-    with attacked_run(folder, WIRES[wire], TIMEOUT_S) as run:
+    with attacked_run(folder, WIRES[wire], timeout_s=TIMEOUT_S) as run:
         page = run.page()
-        run.await_(lambda: run.log().times_ns.size >= LAST)
+        run.await_(lambda: run.logs()[0].times_ns.size >= LAST)
         del page
         time.sleep(chance.uniform(0.0, 1.0))
-        run.emulator.send_signal(signal.SIGSTOP)
+        run.emulators[0].send_signal(signal.SIGSTOP)
         os.kill(loop_of(run.process.pid), signal.SIGKILL)
         time.sleep(down_s)
         returned_ns = time.monotonic_ns()
-        run.emulator.send_signal(signal.SIGCONT)
+        run.emulators[0].send_signal(signal.SIGCONT)
         said_safe, ended_ns = _said_safe(run)
         time.sleep(max(0.0, RETRY_S + RAMP_S - 1e-9 * (time.monotonic_ns() - returned_ns)))
-        log = run.log()
+        log = run.logs()[0]
         wrong = bool(log.unsafe()[log.times_ns >= ended_ns].any())
         late_s = log.beyond_ramp_s(returned_ns)
     return Trial(f"{wire}: down", f"{down_s:.1f} s", said_safe, wrong, late_s)

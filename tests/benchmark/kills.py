@@ -39,8 +39,12 @@ ENDED = {Phase.ENDED, Phase.FAILED, Phase.REFUSED}
 END_S = 60.0
 READABLE_S = 5.0
 STAYS = ", does not end"
+_TRIPS_AT_UM = (12.0, 20.0)
 MODULES = {"loop": b"hilctl.run.loop_process", "guardian": b"hilctl.run.safety.guardian"}
-PHASES = ("start", "ramp in", "condition", "run", "set", "away", "ramp out", "close", "recovery")
+PHASES = (
+    *("start", "ramp in", "condition", "run", "set", "away", "trip", "ramp out", "close"),
+    "recovery",
+)
 TARGETS = (
     *("loop", "guardian", "supervisor"),
     *("loop+guardian", "loop+supervisor", "guardian+supervisor"),
@@ -51,7 +55,7 @@ SIGNALS = {"kill": signal.SIGKILL, "stop": signal.SIGSTOP}
 
 @dataclass(frozen=True, slots=True)
 class Attack:
-    """What one attack came to.
+    """What one attack came to; of several axes, the worst.
 
     Attributes:
         phase: What the run did when it was hit.
@@ -60,6 +64,8 @@ class Attack:
         beyond_ramp_s: Time until the output stayed at its safe value, from the attack or, if the
             loop was to go on, from the end of the run, less what the safe ramp takes.
         largest_step: Largest step from then on, over what the safe ramp may move meanwhile.
+        apart: Largest difference of two outputs from then on, over the one at that time and one
+            step; 0 with one axis, or if a device was away.
         readable_s: Time from the end of the loop until the recording was complete.
         reader: What another reader says against the recording; empty if it agrees.
         is_false: Whether "confirmed" was recorded of an output that was not at its safe value.
@@ -70,13 +76,15 @@ class Attack:
     lost: int
     beyond_ramp_s: float
     largest_step: float
+    apart: float
     readable_s: float
     reader: str
     is_false: bool
 
     def is_good(self, within_s: float, max_step: float) -> bool:
         """Return whether nothing was lost, the output was safe in time, and the readers agree."""
-        safe = self.beyond_ramp_s <= within_s and self.largest_step <= max_step
+        step = max(self.largest_step, self.apart)
+        safe = self.beyond_ramp_s <= within_s and step <= max_step
         recorded = self.lost == 0 and not self.reader and self.readable_s <= READABLE_S
         return recorded and safe and not self.is_false and not self.hit.endswith(STAYS)
 
@@ -109,7 +117,10 @@ def _closing(page: SharedPage) -> bool:
 
 
 def _await(run: AttackedRun, phase: str, chance: random.Random) -> tuple[SharedPage, float]:
-    """Bring a run to a phase; return its page, and how long that phase lasts."""
+    """Bring a run to a phase; return its page, and how long that phase lasts.
+
+    In ``trip`` an interlock of the last device has just tripped.
+    """
     page = run.page()
     if phase == "start":
         return page, 0.6
@@ -120,7 +131,10 @@ def _await(run: AttackedRun, phase: str, chance: random.Random) -> tuple[SharedP
         return page, 0.6 if phase == "condition" else ramp_s
     run.await_(lambda: _in_waveform(page))
     if phase == "away":  # it executes what is sent meanwhile when it returns
-        os.kill(run.emulator.pid, signal.SIGSTOP)
+        os.kill(run.emulators[-1].pid, signal.SIGSTOP)
+    if phase == "trip":
+        run.await_(lambda: any(e.level == "error" for e in page.look_at_events(0)[0]))
+        return page, RAMP_S
     if phase == "set":
         run.hilctl("set", "gain=0.5", "--over", "0.5", stdout=subprocess.DEVNULL).wait(LONGEST_S)
         return page, 0.7
@@ -142,6 +156,7 @@ def attack(
         the loop could put out samples, and how long the recording took to become complete.
     """
     page, lasts_s = _await(run, phase, chance)
+    tripped_ns = time.monotonic_ns()
     time.sleep(chance.uniform(0.0, lasts_s))
     processes = {"supervisor": run.process.pid, **_children(run.process.pid)}
     names = ["loop", "supervisor"] if phase == "recovery" else targets.split("+")
@@ -169,12 +184,12 @@ def attack(
     readable_s = time.monotonic() - began_s
     _await_supervisor(run)
     run.recover()
-    os.kill(run.emulator.pid, signal.SIGCONT)
+    os.kill(run.emulators[-1].pid, signal.SIGCONT)
     return_ns = time.monotonic_ns()
     said += _await_end(run, page)
     run.recover()  # of a loop that was stopped until now
     ends = "loop" in plan or plan.get("supervisor") == "kill" or phase in {"ramp out", "close"}
-    due_ns = hit_ns if ends else stop_ns
+    due_ns = tripped_ns if phase == "trip" else hit_ns if ends else stop_ns
     if phase == "away" or len(plan) == len(processes):  # or until one of them is continued
         due_ns = return_ns
     # Without the start signal the loop has sent nothing, and the output stays as it was.
@@ -217,14 +232,19 @@ def _continue(processes: list[int]) -> None:
 
 
 def _completes(run: AttackedRun) -> bool:
-    """Wait until a recording has its end, or its supervisor has ended without."""
+    """Wait until the recordings have their ends, or their supervisor has ended without."""
     deadline = time.monotonic() + END_S
     while run.process.poll() is None and time.monotonic() < deadline:
-        with suppress(OSError), run.output.open("rb") as file:
-            file.seek(-len(RECORDING_MAGIC), os.SEEK_END)
-            if file.read() == RECORDING_MAGIC and file.tell() > len(RECORDING_MAGIC):
-                return True
+        if all(map(_is_complete, run.outputs)):
+            return True
         time.sleep(0.01)
+    return False
+
+
+def _is_complete(path: Path) -> bool:
+    with suppress(OSError), path.open("rb") as file:
+        file.seek(-len(RECORDING_MAGIC), os.SEEK_END)
+        return file.read() == RECORDING_MAGIC and file.tell() > len(RECORDING_MAGIC)
     return False
 
 
@@ -258,24 +278,30 @@ def _await_end(run: AttackedRun, page: SharedPage) -> str:
 
 def judged(run: AttackedRun, phase: str, done: tuple[str, int, int | None, float, float]) -> Attack:
     said, hit_ns, due_ns, until_ns, readable_s = done
-    log, samples, reader, is_false = run.log(), None, "", False
-    if due_ns is not None or (run.output.exists() and run.output.stat().st_size):
-        try:
-            recording = read(run.output)
-            samples = recording.samples
-            confirmed = recording.end.get("output_state") == "confirmed"
-            is_false = confirmed and bool(abs(log.current_a[-1]) > SAFE_A)
-            reader = verdict(run.output, samples.command.size)
-        except HilctlError as error:
-            reader = str(error)
+    logs, lost, is_false, readers = run.logs(), 0, False, []
+    for log, output in zip(logs, run.outputs, strict=True):
+        samples = None
+        if due_ns is not None or (output.exists() and output.stat().st_size):
+            try:
+                recording = read(output)
+                samples = recording.samples
+                confirmed = recording.end.get("output_state") == "confirmed"
+                is_false |= confirmed and bool(abs(log.current_a[-1]) > SAFE_A)
+                readers.append(verdict(output, samples.command.size))
+            except HilctlError as error:
+                readers.append(str(error))
+        lost += log.lost(samples, until_ns)
+    from_ns = hit_ns if due_ns is None else due_ns
+    pairs = [] if phase == "away" else itertools.combinations(logs, 2)
     return Attack(
         phase=phase,
         hit=said,
-        lost=log.lost(samples, until_ns),
-        beyond_ramp_s=0.0 if due_ns is None else log.beyond_ramp_s(due_ns),
-        largest_step=log.largest_step(hit_ns if due_ns is None else due_ns),
+        lost=lost,
+        beyond_ramp_s=0.0 if due_ns is None else max(each.beyond_ramp_s(due_ns) for each in logs),
+        largest_step=max(each.largest_step(from_ns) for each in logs),
+        apart=max((one.apart(other, from_ns) for one, other in pairs), default=0.0),
         readable_s=readable_s,
-        reader=reader,
+        reader="; ".join(filter(None, readers)),
         is_false=is_false,
     )
 
@@ -292,7 +318,7 @@ def _slow_disk(folder: Path, stall_s: float) -> dict[str, str]:
 
 def print_table(found: list[tuple[str, Attack]]) -> None:
     """Print a line for each phase and each group of processes."""
-    head = "runs  lost  to safe beyond ramp  largest step  readable, after  false confirmed"
+    head = "runs  lost  to safe beyond ramp  largest step  apart  readable, after  false confirmed"
     print(f"{'attack':<40} {head}")
     for name, group in itertools.groupby(sorted(found, key=lambda each: each[0]), lambda e: e[0]):
         rows = [each for _, each in group]
@@ -300,7 +326,8 @@ def print_table(found: list[tuple[str, Attack]]) -> None:
         print(
             f"{name:<40} {len(rows):4} {sum(each.lost for each in rows):5}"
             f" {1e3 * max(each.beyond_ramp_s for each in rows):17.0f} ms"
-            f" {max(each.largest_step for each in rows):13.2f} {readable:4} of {len(rows)}"
+            f" {max(each.largest_step for each in rows):13.2f}"
+            f" {max(each.apart for each in rows):6.2f} {readable:4} of {len(rows)}"
             f" {max(each.readable_s for each in rows):5.1f} s"
             f" {sum(each.is_false for each in rows):16}"
         )
@@ -311,7 +338,7 @@ def main() -> int:
     parser = argparse.ArgumentParser(description=__doc__)
     parser.add_argument("--count", type=int, default=48, help="attacks, over all phases in turn")
     parser.add_argument("--seed", type=int, default=1)
-    parser.add_argument("--wire", choices=WIRES, default="tcp")
+    parser.add_argument("--wire", choices=WIRES, nargs="+", default=["tcp"], help="one per axis")
     parser.add_argument("--phase", choices=PHASES, help="only this one")
     parser.add_argument("--targets", choices=TARGETS, help="only these")
     parser.add_argument("--action", choices=SIGNALS, help="only this one")
@@ -334,8 +361,10 @@ def main() -> int:
         folder = Path(name)
         disk = _slow_disk(folder, options.stall_s)
         for number, (phase, targets) in zip(range(options.count), itertools.cycle(kinds)):
-            wire = WIRES[options.wire]
-            with attacked_run(folder / str(number), wire, environment=disk) as run:
+            wires = [WIRES[name] for name in options.wire]
+            stroke_um = chance.uniform(*_TRIPS_AT_UM) if phase == "trip" else 120.0
+            place = folder / str(number)
+            with attacked_run(place, *wires, stroke_um=stroke_um, environment=disk) as run:
                 attacked = judged(run, phase, attack(run, phase, targets, actions, chance))
             found.append((f"{phase}: {targets}", attacked))
             if not attacked.is_good(1e-3 * options.within_ms, options.max_step):

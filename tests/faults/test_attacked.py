@@ -74,6 +74,16 @@ def test_writes_that_are_not_recorded_are_counted(tmp_path, commands, unanswered
     assert found.lost(samples(commands, unanswered), math.inf) == lost
 
 
+@pytest.mark.parametrize(("late_s", "good"), [(0.0, True), (0.002, True), (0.1, False)])
+def test_outputs_that_come_apart_are_detected(tmp_path, late_s, good):
+    """One ramp begins later than the other."""
+    one, other = (
+        log(tmp_path, [START_A] * round(1 + wait_s / PERIOD_S) + ramp(START_A))
+        for wait_s in (0.0, late_s)
+    )
+    assert (one.apart(other, 0) <= 1.0) == good
+
+
 def test_without_a_recording_all_samples_are_lost(tmp_path):
     assert log(tmp_path, [START_A, START_A]).lost(None, math.inf) == 0
     assert log(tmp_path, [START_A, 2.0, 1.0]).lost(None, math.inf) == 2
@@ -81,13 +91,14 @@ def test_without_a_recording_all_samples_are_lost(tmp_path):
 
 
 GOOD = {"lost": 0, "beyond_ramp_s": 0.1, "largest_step": 0.9, "reader": "", "hit": "kill loop"}
-GOOD |= {"readable_s": 1.0, "is_false": False}
+GOOD |= {"readable_s": 1.0, "is_false": False, "apart": 0.9}
 
 
 @pytest.mark.parametrize("change", [
     {"lost": 1},
     {"beyond_ramp_s": 0.3},
     {"largest_step": 1.1},
+    {"apart": 1.1},
     {"readable_s": 5.1},
     {"reader": other_reader.NOT_INSTALLED},
     {"is_false": True},
