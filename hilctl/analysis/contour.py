@@ -178,7 +178,7 @@ def recordings_by_axis(paths: Sequence[Path]) -> dict[str, Path]:
     """
     facts = {path: _facts(path) for path in paths}
     first = facts[paths[0]]
-    names = _names(first)
+    names = axis_names(first)
     if len(paths) == 1 and names:
         facts |= {path: _facts(path) for path in recordings_in(paths[0].parent)}
     elif not all(each.get("run_id") == first.get("run_id") for each in facts.values()):
@@ -198,7 +198,8 @@ def _facts(path: Path) -> Mapping[str, str]:
         return {}
 
 
-def _names(run: Mapping[str, str]) -> list[str]:
+def axis_names(run: Mapping[str, str]) -> list[str]:
+    """Return the names of all axes from the metadata of a run; empty if it has one axis."""
     try:
         names = json.loads(run.get(AXES_FACT, "[]"))
     except ValueError:

@@ -240,6 +240,7 @@ def _duration(seconds: float) -> str:
 def print_row(varied: Sequence[VariedParameter], step: CampaignStep, row: CampaignRow) -> None:
     """Print a completed step."""
     values = "reference run" if step.is_reference else texts_of(varied, _values(step))
+    values = f"{values} {row.axis}".rstrip()
     figures, text = row.figures, row.result
     if row.code == COMPLETED:
         parts = [
@@ -247,6 +248,7 @@ def print_row(varied: Sequence[VariedParameter], step: CampaignStep, row: Campai
             (figures.peak_hysteresis_percent, "hyst. {:.3g} %"),
             (figures.peak_error_percent, "error {:.3g} %"),
             (figures.natural_hz, "resonance {:.4g} Hz"),
+            (row.contour_um, "contour {:.3g} µm"),
         ]
         text = "  ".join(form.format(value) for value, form in parts if value is not None)
     kept = "done earlier  " if row.kept else ""
@@ -255,7 +257,7 @@ def print_row(varied: Sequence[VariedParameter], step: CampaignStep, row: Campai
 
 def result_mapping(result: CampaignResult) -> dict[str, Any]:
     """Return the result of a campaign as plain values."""
-    codes = [row.code for _, row in result.ordered]
+    codes = result.codes
     return {
         "campaign": result.plan.campaign.config.name,
         "folder": str(result.plan.folder),

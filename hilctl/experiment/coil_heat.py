@@ -5,6 +5,7 @@ the initial heat, so a run is simulated only once.
 """
 
 import math
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import numpy as np
@@ -107,6 +108,15 @@ class RunHeat:
     seconds: float = 0.0  # duration of the run
     alone_a2: float = 0.0  # final heat of an initially cold coil, in A^2
     hottest_a2: float = math.inf  # highest initial heat within the budget; infinite without one
+
+
+def of_hottest(heats: Sequence[RunHeat]) -> RunHeat:
+    """Return the effect on the coil of each axis, as if all were the hottest one."""
+    return RunHeat(
+        max(each.seconds for each in heats),
+        max(each.alone_a2 for each in heats),
+        min(each.hottest_a2 for each in heats),
+    )
 
 
 class CoolingCoil:

@@ -109,14 +109,14 @@ def load_experiment(path: Path, settings: Sequence[str] = ()) -> LoadedExperimen
 
 def load_axes(path: Path, settings: Sequence[str] = ()) -> tuple[LoadedExperiment, ...]:
     """Load an experiment file with one axis or several, see :func:`load_experiment`."""
-    document = with_settings(load_document(path), _from_here(path, settings))
-    return resolve_axes(document, path.parent, TextFiles())
+    return resolve_axes(load_document(path), path.parent, _from_here(path, settings), TextFiles())
 
 
 def resolve_axes(
-    document: Document, folder: Path, files: TextFiles
+    document: Document, folder: Path, settings: Sequence[str], files: TextFiles
 ) -> tuple[LoadedExperiment, ...]:
     """Build the experiment of each axis from a YAML document, see :func:`load_experiment`."""
+    document = with_settings(document, settings)
     loaded = of_each_axis(document, lambda axis, part: _resolved(part, folder, files, axis))
     return tuple(loaded.values())
 

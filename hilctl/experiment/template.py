@@ -129,7 +129,7 @@ def starting_experiment(
     _set(whole, settings)
     head = _head(device, path)
     text = head + commented(whole.data, {**remarks, **device.remarks})
-    check_axes(resolve_axes(Document(str(path), text), path.parent, files))
+    check_axes(resolve_axes(Document(str(path), text), path.parent, (), files))
     return text, made.info
 
 

@@ -1,7 +1,7 @@
 """Progress and result of a run."""
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, field
+from dataclasses import dataclass, field, replace
 from pathlib import Path
 from typing import Any, Self
 
@@ -79,6 +79,11 @@ class RunResult:
             axes=own,
             **run,
         )
+
+    def moved(self, paths: Mapping[str, Path]) -> Self:
+        """Return the result with other recordings, by the names of the axes."""
+        axes = {name: replace(each, path=paths[name]) for name, each in self.axes.items()}
+        return replace(self, path=next(iter(paths.values())), axes=axes)
 
     @property
     def recordings(self) -> list[Path]:

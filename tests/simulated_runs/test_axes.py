@@ -8,10 +8,13 @@ import pytest
 import yaml
 from mcap.reader import make_reader
 
+from hilctl import api
 from hilctl.analysis.replay import replay
 from hilctl.base.errors import InputError
 from hilctl.base.samples import Flag
+from hilctl.cli.campaigns import sweep_document
 from hilctl.kernels.interlock import InterlockFlag
+from hilctl.lab.studies.campaign.steps import campaign_of
 from hilctl.recording.reader import read
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.schema import TOPICS
@@ -185,6 +188,16 @@ def test_the_command_prints_a_line_per_axis(tmp_path):
     assert found["axes"]["y"]["output"] == str(tmp_path / "run.y.mcap")
     assert found["axes"]["y"]["samples"] == 1000
     assert found["output"] == str(tmp_path / "run.x.mcap")
+
+
+def test_a_campaign_has_a_row_per_axis_with_the_contour_error(tmp_path):
+    steps = campaign_of(sweep_document(STAGE, ["waveform.amplitude=20,30"], 1), Path(), SHORT)
+    result = api.campaign(steps, tmp_path, fast=True)
+    assert [row.axis for _, row in result.ordered] == ["x", "y"] * 2
+    for _, row in result.ordered:
+        report = api.contour([tmp_path / row.recording])
+        assert row.contour_um == report.peak_um
+        assert row.figures.peak_error_percent == report.axes[row.axis].peak_error_percent
 
 
 @pytest.mark.long

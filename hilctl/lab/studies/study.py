@@ -277,18 +277,14 @@ class _Engine:
 
     def _kept(self, step: StudyStep, keys: Mapping[str, RunKey], file: Path) -> StudyRun | None:
         """Return an earlier run of a step, which counts once; None without one."""
-        first, key = next(iter(keys.items()))
-        recorded = self._completed.get(key, [])
+        recorded = self._completed.get(tuple(keys.values()), [])
         while recorded:
-            path = recorded.pop(0)
-            whole = path.with_stem(path.stem.removesuffix(f".{first}")) if first else path
-            paths = recordings_of([*keys], whole)
-            run = StudyRun(step, tuple(paths.values()), kept=True)
-            if all(completed_key(paths[axis]) == keys[axis] for axis in keys) and not run.flaw:
+            run = StudyRun(step, recorded.pop(0), kept=True)
+            if not run.flaw:
                 return run
         # Once a step has run again, its results may change the steps after it.
-        there = recordings_of([first], file)[first]
-        if step.replaces and not self.moved and completed_key(there) not in {None, key}:
+        axis, there = next(iter(recordings_of([*keys], file).items()))
+        if step.replaces and not self.moved and completed_key(there) not in {None, keys[axis]}:
             raise InputError(
                 f"{there} was recorded with other settings: restore them, choose another --folder, "
                 "or replace all recordings with --overwrite"

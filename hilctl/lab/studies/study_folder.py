@@ -7,9 +7,11 @@ from pathlib import Path
 
 from mcap.writer import MCAP0_MAGIC
 
+from hilctl.analysis.contour import axis_names
 from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import exists, reason
 from hilctl.base.private_dirs import HAS_LOCKS, take_lock
+from hilctl.recording.metadata_keys import AXIS_FACT
 from hilctl.recording.recording_files import is_being_recorded
 from hilctl.recording.recover import recover_recording
 from hilctl.recording.run_summary import read_ends, recordings_in
@@ -124,13 +126,20 @@ def _put_aside(path: Path) -> list[str]:
     return [f"{path}: run never started; kept as {torn.name}"]
 
 
-def completed_runs(folder: Path) -> dict[RunKey, list[Path]]:
-    """Return the recordings of completed runs in a folder, sorted by name."""
-    found: dict[RunKey, list[Path]] = {}
+def completed_runs(folder: Path) -> dict[tuple[RunKey, ...], list[tuple[Path, ...]]]:
+    """Return the recordings of completed runs in a folder, sorted by name, of all axes of each."""
+    found: dict[tuple[RunKey, ...], list[tuple[Path, ...]]] = {}
+    axes: dict[str, dict[str, tuple[RunKey, Path]]] = {}
     for path in recordings_in(folder):
-        key = completed_key(path)
-        if key is not None:
-            found.setdefault(key, []).append(path)
+        if (key := completed_key(path)) is None:
+            continue
+        run = read_ends(path).run
+        names = axis_names(run) or [""]
+        there = axes.setdefault(run["run_id"] if run.get(AXIS_FACT) else str(path), {})
+        there[run.get(AXIS_FACT, "")] = key, path
+        if all(name in there for name in names):
+            keys, paths = zip(*(there.pop(name) for name in names), strict=True)
+            found.setdefault(keys, []).append(paths)
     return found
 
 

@@ -9,16 +9,17 @@ pauses would leave in real time.
 import math
 import signal
 import tempfile
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
 from pathlib import Path
 
+from hilctl.analysis.contour import contour
 from hilctl.base.errors import ConfigError, HilctlError, InputError, RunError
 from hilctl.base.files import TextFiles, write_file
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import resolve
-from hilctl.experiment.preflight import CheckedRun, check
+from hilctl.experiment.preflight import check_axes
 from hilctl.experiment.state_files import MachineTime
 from hilctl.lab.identify.parallel import workers
 from hilctl.lab.studies.campaign.plan import CampaignPlan, PlannedStep, planned
@@ -39,8 +40,9 @@ from hilctl.lab.studies.study import (
     run_study,
 )
 from hilctl.lab.studies.study_folder import completed_runs, last_started
+from hilctl.recording.metadata_keys import AXIS_FACT
 from hilctl.recording.reader import read
-from hilctl.run.result import RunResult
+from hilctl.run.result import RunResult, recordings_of
 from hilctl.run.unpaced import run_unpaced
 
 _FIRST_PAGE_S = 60.0
@@ -69,18 +71,25 @@ class CampaignResult:
 
     @property
     def ordered(self) -> list[tuple[CampaignStep, CampaignRow]]:
-        """All steps in order, each with its row."""
+        """All steps in order, each with its rows, one per axis."""
         return ordered(self.plan, self.rows)
 
     @property
     def drift(self) -> SeriesDrift | None:
-        """Drift over the reference runs."""
-        references = [row for step, row in self.ordered if step.is_reference]
+        """Drift over the reference runs, of the first axis."""
+        numbers = [each.step.number for each in self.plan.steps if each.step.is_reference]
+        references = [self.rows[number] for number in numbers if number in self.rows]
         return drift_of([row.figures for row in references if row.code == COMPLETED])
+
+    @property
+    def codes(self) -> list[str]:
+        """Code of each step."""
+        rows = (self.rows.get(each.step.number, CampaignRow()) for each in self.plan.steps)
+        return [row.code for row in rows]
 
     def count(self, code: str) -> int:
         """Return the number of steps with a code."""
-        return sum(row.code == code for _, row in self.ordered)
+        return self.codes.count(code)
 
 
 class Campaign:
@@ -96,7 +105,7 @@ class Campaign:
         self,
         plan: CampaignPlan,
         host: StudyHost,
-        row_of: Callable[[StudyRun], CampaignRow] = lambda run: measured(run.path),
+        row_of: Callable[[StudyRun], CampaignRow] = lambda run: measured(run.paths),
     ) -> None:
         self.plan = plan
         self.rows: dict[int, CampaignRow] = {}
@@ -111,7 +120,7 @@ class Campaign:
         for each in self.plan.steps:
             if each.kept is not None:
                 run = yield self._step(each, 0.0)
-                self._add(each, replace(measured(run.path), kept=True))
+                self._add(each, replace(measured(run.paths), kept=True))
         self.tables = write_table(self.plan, self.rows)
         done_s = 0.0
         try:
@@ -135,7 +144,7 @@ class Campaign:
             text=each.step.text,
             repeats=0,  # a stall is marked, and the next call repeats the step
             cool_to_rms_a=config.cool_down.to_rms_a or math.inf,
-            loaded=(each.loaded,),
+            loaded=each.loaded,
             heat=each.heat,
             done_s=done_s,
         )
@@ -167,7 +176,8 @@ class Campaign:
             self.tables = write_table(self.plan, self.rows)
             if self._host.now().boot_s >= self._next_page_s:
                 self._write_page()
-        self._host.on_step(each.step, row)
+        for one in (row, *row.others):
+            self._host.on_step(each.step, one)
 
     def result(self, reason: str = "", stop_signal: int = 0) -> CampaignResult:
         """Return the result so far, and write its page."""
@@ -189,10 +199,25 @@ class Campaign:
         self._next_page_s = now_s + max(_FIRST_PAGE_S, _PAGE_SHARE * (now_s - start_s))
 
 
-def measured(path: Path) -> CampaignRow:
-    """Return the row of a completed run."""
-    digest = digest_of(read(path))
-    return CampaignRow(COMPLETED, digest.figures, path.name, COMPLETED, digest=digest)
+def measured(paths: Sequence[Path]) -> CampaignRow:
+    """Return the row of the first axis of a completed run, with those of the others."""
+    recordings, contour_um = {path: read(path) for path in paths}, None
+    if len(paths) > 1 and all(each.compensated for each in recordings.values()):
+        report, _ = contour({each.run[AXIS_FACT]: [each] for each in recordings.values()})
+        contour_um = report.peak_um
+    first, *others = (
+        CampaignRow(
+            COMPLETED,
+            (digest := digest_of(each)).figures,
+            path.name,
+            COMPLETED,
+            digest=digest,
+            axis=each.run.get(AXIS_FACT, ""),
+            contour_um=contour_um,
+        )
+        for path, each in recordings.items()
+    )
+    return replace(first, others=tuple(others))
 
 
 def failed(code: str, reason: str, path: Path | None = None) -> CampaignRow:
@@ -206,7 +231,8 @@ def planned_in_real_time(campaign: CampaignSteps, folder: Path, now: MachineTime
     plan = planned(campaign, folder, completed, 0.0)
     if not plan.left:
         return plan
-    heat_a2 = heat_of(plan.left[0].loaded, last_started(folder), now)
+    last = last_started(folder)
+    heat_a2 = max(heat_of(each, last, now) for each in plan.left[0].loaded)
     return planned(campaign, folder, completed, heat_a2) if heat_a2 > 0.0 else plan
 
 
@@ -224,49 +250,55 @@ def run_series(plan: CampaignPlan, host: StudyHost) -> CampaignResult:
 class FastTask:
     """Input of one run."""
 
-    experiment: str  # the experiment as YAML
+    experiments: Mapping[str, str]  # the experiment of each axis as YAML
     files: Mapping[str, str]  # texts of the files it uses, by absolute path
     folder: str  # folder that its file names are relative to
     heat_a2: float  # heat of the coil before it, in A^2
 
 
-def run_task(task: FastTask) -> tuple[bytes, RunResult | HilctlError, CampaignRow | None]:
+def run_task(task: FastTask) -> tuple[list[bytes], RunResult | HilctlError, CampaignRow | None]:
     """Run one step on a worker.
 
-    Return its recording, its result, and its row if it was completed. An error replaces the result
-    if it was refused.
+    Return the recording of each axis, its result, and its row if it was completed. An error
+    replaces the result if it was refused.
     """
-    document = Document("experiment", task.experiment)
-    loaded = resolve(document, Path(task.folder), files=TextFiles(task.files))
+    place, files = Path(task.folder), TextFiles(task.files)
+    loaded = [
+        replace(resolve(Document("experiment", text), place, files=files), axis=axis)
+        for axis, text in task.experiments.items()
+    ]
     with tempfile.TemporaryDirectory(prefix="hilctl-campaign-") as folder:
         output = Path(folder) / "run.mcap"
         try:
-            checked = check(loaded, task.heat_a2)
-            result = run_unpaced(CheckedRun((checked,)), output)
+            result = run_unpaced(check_axes(loaded, task.heat_a2), output)
         except HilctlError as error:
-            return b"", error, None
-        row = measured(output) if result.code == COMPLETED else None
-        return output.read_bytes(), result, row
+            return [], error, None
+        row = measured(result.recordings) if result.code == COMPLETED else None
+        return [path.read_bytes() for path in result.recordings], result, row
 
 
 @dataclass(frozen=True, slots=True)
 class WorkerRuns:
     """Results of steps on workers, in the order of the steps, and the rows of those taken."""
 
-    results: Iterator[tuple[bytes, RunResult | HilctlError, CampaignRow | None]]
+    results: Iterator[tuple[list[bytes], RunResult | HilctlError, CampaignRow | None]]
     rows: dict[Path, CampaignRow] = field(default_factory=dict)
 
     def take(
         self, path: Path, settings: object, output: Path, *_: object, **__: object
     ) -> RunResult:
-        """Write the recording of the next step; return its result, or raise its error."""
-        content, result, row = next(self.results)
+        """Write the recordings of the next step; return its result, or raise its error."""
+        contents, result, row = next(self.results)
         if isinstance(result, HilctlError):
             raise result
-        write_file(output, lambda stream: stream.write(content), overwrite=False)
+        paths = recordings_of([*result.axes] or [""], output)
+        for target, content in zip(paths.values(), contents, strict=True):
+            write_file(target, lambda stream: stream.write(content), overwrite=False)  # noqa: B023
+        result = result.moved(paths)
         if row is not None:
-            self.rows[output] = replace(row, recording=output.name)
-        return replace(result, path=output)
+            others = tuple(replace(each, recording=paths[each.axis].name) for each in row.others)
+            self.rows[result.path] = replace(row, recording=result.path.name, others=others)
+        return result
 
     def row_of(self, run: StudyRun) -> CampaignRow:
         """Return the row of a run."""
@@ -277,10 +309,10 @@ def planned_fast(campaign: CampaignSteps, folder: Path) -> CampaignPlan:
     """Return the plan of a campaign without real time; raise InputError for a real device."""
     plan = planned(campaign, folder, completed_runs(folder))
     for each in plan.steps:
-        info = each.loaded.device.info
-        if not info.simulated:
-            rule = "only simulated devices run without real time"
-            raise InputError(f"--fast: {each.step.text}: {info.name}: {rule}")
+        for info in (axis.device.info for axis in each.loaded):
+            if not info.simulated:
+                rule = "only simulated devices run without real time"
+                raise InputError(f"--fast: {each.step.text}: {info.name}: {rule}")
     return plan
 
 
@@ -294,6 +326,6 @@ def run_fast(plan: CampaignPlan, host: StudyHost, scheduler: str = "none") -> Ca
 
 
 def _task(each: PlannedStep) -> FastTask:
-    loaded = each.loaded
-    folder = str(loaded.folder.absolute())  # a link stays, as in the names of the texts
-    return FastTask(loaded.yaml_text, dict(loaded.files.texts), folder, each.heat_a2)
+    texts, first = {axis.axis: axis.yaml_text for axis in each.loaded}, each.loaded[0]
+    folder = str(first.folder.absolute())  # a link stays, as in the names of the texts
+    return FastTask(texts, dict(first.files.texts), folder, each.heat_a2)

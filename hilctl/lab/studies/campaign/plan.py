@@ -6,9 +6,10 @@ from pathlib import Path
 
 from hilctl.base.errors import ConfigError, ConfigProblem
 from hilctl.base.files import TextFiles
-from hilctl.experiment.coil_heat import CoolingCoil, RunHeat
+from hilctl.experiment.coil_heat import CoolingCoil, RunHeat, of_hottest
 from hilctl.experiment.load import LoadedExperiment
-from hilctl.experiment.preflight import check
+from hilctl.experiment.preflight import check_axes
+from hilctl.experiment.rig import RunRig
 from hilctl.lab.studies.campaign.steps import CampaignStep, CampaignSteps, key_of, locs_of
 from hilctl.lab.studies.study import free_mb
 from hilctl.run.start import RunKey
@@ -22,11 +23,11 @@ class PlannedStep:
     """A step to run, or done already."""
 
     step: CampaignStep
-    loaded: LoadedExperiment
+    loaded: tuple[LoadedExperiment, ...]  # of each axis
     settings: tuple[str, ...]  # all ``key=value`` texts over the base experiment
-    key: RunKey  # fingerprint of its experiment in a recording
-    kept: Path | None = None  # its recording, if it is done already
-    heat: RunHeat = _NO_HEAT  # heat of its current in the coil
+    keys: tuple[RunKey, ...]  # fingerprint of each axis' experiment in a recording
+    kept: Path | None = None  # recording of its first axis, if it is done already
+    heat: RunHeat = _NO_HEAT  # heat of its current in the hottest coil
     megabytes: float = 0.0  # approximate size of its recording
     heat_a2: float = 0.0  # heat of the coil before it, in A^2, if no step is interrupted
     pause_s: float = 0.0  # time for the coil to cool before it
@@ -35,6 +36,17 @@ class PlannedStep:
     def seconds(self) -> float:
         """Duration of the run."""
         return self.heat.seconds
+
+    @property
+    def has_budget(self) -> bool:
+        """Whether a coil has a thermal budget."""
+        return self.slowest_coil.interlocks.thermal_time_constant_s is not None
+
+    @property
+    def slowest_coil(self) -> RunRig:
+        """The axis whose coil cools slowest."""
+        rigs = [each.rig for each in self.loaded]
+        return max(rigs, key=lambda rig: rig.interlocks.thermal_time_constant_s or 0.0)
 
 
 @dataclass(frozen=True, slots=True)
@@ -70,7 +82,7 @@ class CampaignPlan:
 def planned(
     campaign: CampaignSteps,
     folder: Path,
-    completed: Mapping[RunKey, Sequence[Path]],
+    completed: Mapping[tuple[RunKey, ...], Sequence[tuple[Path, ...]]],
     heat_a2: float | None = None,
 ) -> CampaignPlan:
     """Check and plan the remaining steps; raise ConfigError with all problems.
@@ -86,11 +98,10 @@ def planned(
     for step in campaign.steps:
         try:
             each = _loaded(campaign, step, files)
-            kept = left.get(each.key)
-            each = replace(each, kept=kept.pop(0) if kept else None)
+            kept = left.get(each.keys)
+            each = replace(each, kept=kept.pop(0)[0] if kept else None)
             # Steps that differ in noise only are checked once; kept steps are not checked again.
-            budget_s = each.loaded.config.limits.thermal_time_constant_s
-            if each.kept is None or (heat_a2 is None and budget_s is not None):
+            if each.kept is None or (heat_a2 is None and each.has_budget):
                 each = _checked(each, known)
             steps.append(each)
         except ConfigError as error:
@@ -103,15 +114,17 @@ def _loaded(campaign: CampaignSteps, step: CampaignStep, files: TextFiles) -> Pl
     with campaign.base_read():
         settings = tuple(campaign.settings_for(step, files))
         loaded = campaign.load(step, files)
-    return PlannedStep(step, loaded, settings, RunKey.of(loaded))
+    return PlannedStep(step, loaded, settings, tuple(map(RunKey.of, loaded)))
 
 
 def _checked(each: PlannedStep, known: dict[tuple[str, ...], PlannedStep]) -> PlannedStep:
     same = known.get(each.step.settings)
     if same is None:
         # Cooled down: heat of the last run causes a pause, not an error.
-        forecast = check(each.loaded, heat_a2=None).forecast
-        same = replace(each, heat=forecast.heat, megabytes=forecast.recording_mb)
+        forecasts = [axis.forecast for axis in check_axes(each.loaded, heat_a2=None).axes]
+        heat = of_hottest([forecast.heat for forecast in forecasts])
+        megabytes = sum(forecast.recording_mb for forecast in forecasts)
+        same = replace(each, heat=heat, megabytes=megabytes)
         known[each.step.settings] = same
     return replace(each, heat=same.heat, megabytes=same.megabytes)
 
@@ -127,7 +140,7 @@ def _cooling(
         if heat_a2 is not None and each.kept is not None:
             found.append(each)
             continue
-        coil = CoolingCoil(each.loaded.rig, heat_now_a2, now_s)
+        coil = CoolingCoil(each.slowest_coil, heat_now_a2, now_s)
         pause_s = coil.pause_s(each.heat, now_s, to_rms_a)
         found.append(replace(each, pause_s=pause_s, heat_a2=coil.heat_a2(now_s + pause_s)))
         now_s += pause_s + each.seconds

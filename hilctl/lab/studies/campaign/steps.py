@@ -14,13 +14,14 @@ from typing import Annotated, Any, Literal, TypeAlias
 import numpy as np
 from pydantic import Field
 
+from hilctl.base.axes import axis_documents
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.strict import StrictModel
 from hilctl.base.yaml import Document, Loc, dotted, load_document, setting, texts_of
 from hilctl.experiment.devices import device_class, known_devices
 from hilctl.experiment.file import Name
-from hilctl.experiment.load import LoadedExperiment, document_with, named_from, resolve
+from hilctl.experiment.load import LoadedExperiment, document_with, named_from, resolve_axes
 from hilctl.experiment.sections.conditioning import Condition
 
 RunOrder = Literal["as_written", "random", "alternating"]
@@ -221,24 +222,26 @@ class CampaignSteps:
         except InputError as error:
             raise ConfigError([self.document.problem("experiment", str(error))]) from None
 
-    def load(self, step: CampaignStep, files: TextFiles) -> LoadedExperiment:
-        """Return the experiment of a step; raise InputError if it cannot be read or is invalid."""
-        document = load_document(self.experiment, files)
-        return resolve(document, self.experiment.parent, self.settings_for(step, files), files)
+    def load(self, step: CampaignStep, files: TextFiles) -> tuple[LoadedExperiment, ...]:
+        """Return the experiment of each axis of a step; raise InputError if it is not usable."""
+        document, settings = load_document(self.experiment, files), self.settings_for(step, files)
+        return resolve_axes(document, self.experiment.parent, settings, files)
 
     def settings_for(self, step: CampaignStep, files: TextFiles) -> list[str]:
         """Return all ``key=value`` texts of a step, outermost last."""
         # Each run of a simulated device gets its own, reproducible noise.
         settings = [*self.settings, *step.settings]
         document = document_with(self.experiment, settings, files)
-        kind, first = (document.value(("device", key)) for key in ("kind", "seed"))
-        if {"device.seed", "axes"} & {*self.keys, *document.data} or kind not in known_devices():
-            return settings
-        field = device_class(kind).Options.model_fields.get("seed")
-        first = field.default if field and first is None else first
-        if field and isinstance(first, int):
-            own = json.dumps([step.settings, step.repeat, step.is_reference])
-            settings.append(f"device.seed={first + zlib.crc32(own.encode()) % _SEEDS}")
+        own = json.dumps([step.settings, step.repeat, step.is_reference])
+        for axis, part in axis_documents(document).items():
+            key = f"axes.{axis}.device.seed" if axis else "device.seed"
+            kind, first = (part.value(("device", name)) for name in ("kind", "seed"))
+            if {"device.seed", key} & {*self.keys} or kind not in known_devices():
+                continue
+            field = device_class(kind).Options.model_fields.get("seed")
+            first = field.default if field and first is None else first
+            if field and isinstance(first, int):
+                settings.append(f"{key}={first + zlib.crc32(own.encode()) % _SEEDS}")
         return settings
 
 

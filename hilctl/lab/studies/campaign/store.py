@@ -51,6 +51,9 @@ class CampaignRow:
     recording: str = ""  # name of its recording in the campaign's folder, or empty
     code: str = PLANNED  # ``planned``, ``completed``, ``refused``, ``fault`` or ``stopped``
     kept: bool = False  # whether it was done already
+    axis: str = ""  # name of the axis; empty if there is only one, or if it was not completed
+    contour_um: float | None = None  # peak contour error of all axes
+    others: tuple["CampaignRow", ...] = ()  # rows of the other axes
     digest: RunDigest | None = field(default=None, compare=False, repr=False)
 
 
@@ -65,8 +68,13 @@ def columns_of(
     }
     for key in keys:
         columns[key] = _one_type([cell(step.point.get(key)) for step, _ in rows])
+    axes = {row.axis for _, row in rows} != {""}
+    if axes:
+        columns["axis"] = [row.axis for _, row in rows]
     for name in FIGURES:
         columns[name] = [getattr(row.figures, name) for _, row in rows]
+    if axes:
+        columns["contour_um"] = [row.contour_um for _, row in rows]
     columns[RESULT] = [row.result for _, row in rows]
     columns[RECORDING] = [row.recording for _, row in rows]
     return columns
@@ -87,8 +95,9 @@ def _one_type(values: list[Any]) -> list[Any]:
 def ordered(
     plan: CampaignPlan, rows: Mapping[int, CampaignRow]
 ) -> list[tuple[CampaignStep, CampaignRow]]:
-    """Return all steps in order, each with its row."""
-    return [(each.step, rows.get(each.step.number, CampaignRow())) for each in plan.steps]
+    """Return all steps in order, each with its rows, one per axis."""
+    found = [(each.step, rows.get(each.step.number, CampaignRow())) for each in plan.steps]
+    return [(step, each) for step, row in found for each in (row, *row.others)]
 
 
 def write_table(plan: CampaignPlan, rows: Mapping[int, CampaignRow]) -> list[Path]:
@@ -118,6 +127,7 @@ def csv_text(table: Mapping[str, Sequence[Any]]) -> str:
 def entry_of(step: CampaignStep, row: CampaignRow) -> SeriesRun:
     """Return a step and its outcome as a run of a report."""
     values = {key: short_value(value) for key, value in step.point.items()}
+    values |= {"axis": row.axis} if row.axis else {}
     return SeriesRun(
         step.number, step.is_reference, values, row.figures, row.result, row.recording,
         row.digest, step.repeat,

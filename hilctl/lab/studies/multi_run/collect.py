@@ -168,8 +168,10 @@ class RunSeries:
 
     @property
     def drift(self) -> SeriesDrift | None:
-        """Drift over the reference runs."""
-        return drift_of([run.figures for run in self.runs if run.is_reference and run.completed])
+        """Drift over the reference runs, of the first axis."""
+        runs = [run for run in self.runs if run.is_reference and run.completed]
+        first = runs[0].values.get("axis") if runs else None
+        return drift_of([run.figures for run in runs if run.values.get("axis") == first])
 
     @property
     def failed(self) -> tuple[SeriesRun, ...]:

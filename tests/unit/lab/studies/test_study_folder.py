@@ -68,11 +68,11 @@ def test_only_completed_runs_count_and_truncated_ones_are_repaired(recorded, tmp
     content, torn = path.read_bytes(), tmp_path / "torn.mcap"
     torn.write_bytes(content[: len(content) // 2])
     (tmp_path / "text.mcap").write_text("no recording")
-    assert folders.completed_runs(tmp_path) == {key: [path, again]}
+    assert folders.completed_runs(tmp_path) == {(key,): [(path,), (again,)]}
     assert folders.last_started(tmp_path) == again
     assert [text.startswith(f"{torn}: ") for text in folders.repair_recordings(tmp_path)] == [True]
     assert folders.repair_recordings(tmp_path) == []
-    assert folders.completed_runs(tmp_path) == {key: [path, again]}
+    assert folders.completed_runs(tmp_path) == {(key,): [(path,), (again,)]}
     assert folders.last_started(tmp_path / "absent") is None
 
 
@@ -94,7 +94,7 @@ def test_special_files_are_ignored(recorded, tmp_path):
     (tmp_path / "d.mcap").symlink_to("nowhere")
     (tmp_path / "e.mcap").symlink_to("b.mcap")
     assert folders.repair_recordings(tmp_path) == []
-    assert folders.completed_runs(tmp_path) == {key: [path]}
+    assert folders.completed_runs(tmp_path) == {(key,): [(path,)]}
     assert folders.last_started(tmp_path) == path
 
 

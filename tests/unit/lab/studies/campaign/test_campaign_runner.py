@@ -1,5 +1,6 @@
 """Campaigns, in real time and without."""
 
+import csv
 import importlib.util
 import signal
 from dataclasses import replace
@@ -17,8 +18,8 @@ from hilctl.lab.studies.campaign.campaign_runner import (
 from hilctl.lab.studies.campaign.plan import CampaignPlan
 from hilctl.lab.studies.study import StepFaultError, StudyHost
 from hilctl.recording.reader import read
-from hilctl.run.start import completed_key
-from tests.unit.lab.studies.campaign.conftest import CAMPAIGN
+from hilctl.run.start import completed_key, unpaced
+from tests.unit.lab.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 from tests.unit.lab.studies.conftest import StudyRig
 
 BUDGET = "set: {limits.rms_current_a: 0.9, limits.thermal_time_constant_s: 3.0}\n"
@@ -216,6 +217,40 @@ def test_a_dask_cluster_gives_the_same_table(campaign, tmp_path):
         assert mine.displacement_um.tobytes() == theirs.displacement_um.tobytes()
 
 
+def test_a_row_per_axis(campaign, experiment, tmp_path):
+    """A step of two axes is one run; another call keeps it only with all its recordings."""
+    axes = "axes:\n  x: {device: {seed: 5}}\n  y: {device: {seed: 6}, waveform: {amplitude: 1.0}}\n"
+    experiment.write_text(EXPERIMENT.replace("amplitude: 2.0, ", "") + axes)
+    text = CAMPAIGN.replace("  waveform.amplitude: [1.0, 2.0]\n", "").replace(
+        "waveform.frequency_hz: [10.0, 20.0]", "axes.x.waveform.amplitude: [1.0, 2.0]"
+    )
+    folder = tmp_path / "runs"
+    few = campaign(text + "reference_run: {every: 2, set: {axes.x.waveform.amplitude: 1.5}}\n")
+    result = run_fast(planned_fast(few, folder), StudyHost())
+    assert [(step.number, row.axis) for step, row in result.ordered] == [
+        (number, axis) for number in range(1, 5) for axis in "xy"
+    ]
+    assert result.codes == ["completed"] * 4
+    swings = [row.figures.peak_to_peak_um for _, row in result.ordered]
+    assert swings[4] > 1.3 * swings[2]  # of x
+    assert swings[5] == pytest.approx(swings[3], rel=0.1)
+    assert result.drift is not None
+    rows = [*csv.DictReader(result.tables[0].read_text().splitlines())]
+    assert [row["axis"] for row in rows] == [*"xy"] * 4
+    names = [f"few-000{number}.{axis}.mcap" for number in range(1, 5) for axis in "xy"]
+    assert [row["recording"] for row in rows] == names
+    again = planned_fast(few, folder)
+    assert again.left == ()
+    assert [row.kept for row in run_fast(again, StudyHost()).rows.values()] == [True] * 4
+    (folder / "few-0002.y.mcap").unlink()
+    assert [each.step.number for each in planned_fast(few, folder).left] == [2]
+    rig = Rig()
+    plan = planned_in_real_time(few, folder, rig.now())
+    done = run_series(plan, replace(rig.host, run=unpaced))
+    assert done.codes == ["completed"] * 4
+    assert rig.rows.count((2, "completed", False)) == 2
+
+
 def test_a_fault_of_the_rig_ends_it(campaign, tmp_path):
     text = CAMPAIGN + "  device.fault: [null, {kind: sensor_nan, at_sample: 100}]\n"
     result = run_fast(planned_fast(campaign(text), tmp_path), StudyHost())
@@ -226,7 +261,7 @@ def test_a_fault_of_the_rig_ends_it(campaign, tmp_path):
 
 def test_only_simulated_devices(campaign, tmp_path, monkeypatch):
     device = SimpleNamespace(info=SimpleNamespace(simulated=False, name="modbus_dac"))
-    step = SimpleNamespace(step=campaign().steps[0], loaded=SimpleNamespace(device=device))
+    step = SimpleNamespace(step=campaign().steps[0], loaded=[SimpleNamespace(device=device)])
     monkeypatch.setattr(
         "hilctl.lab.studies.campaign.campaign_runner.planned",
         lambda *_: CampaignPlan(campaign(), tmp_path, (step,), 1.0),

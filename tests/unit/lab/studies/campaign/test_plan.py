@@ -60,7 +60,7 @@ def test_completed_steps_are_not_planned(campaign, tmp_path):
     """Each recording counts once, for the same experiment only."""
     twice = campaign(CAMPAIGN + "repeat: 2")
     plan = planned(twice, tmp_path, {}, 0.0)
-    completed = {plan.steps[0].key: [tmp_path / "a.mcap"]}
+    completed = {plan.steps[0].keys: [(tmp_path / "a.mcap",)]}
     again = planned(twice, tmp_path, completed, 0.0)
     assert [each.kept is not None for each in again.steps] == [True] + [False] * 7
     longer = campaign(CAMPAIGN + "set: {waveform.duration_s: 0.5}")

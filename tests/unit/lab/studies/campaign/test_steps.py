@@ -12,7 +12,7 @@ from tests.unit.lab.studies.campaign.conftest import CAMPAIGN, EXPERIMENT
 def test_each_step_is_the_experiment_with_its_values(campaign):
     few = campaign()
     assert few.keys == ("waveform.amplitude", "waveform.frequency_hz")
-    loaded = [few.load(step, TextFiles()).config for step in few.steps]
+    loaded = [few.load(step, TextFiles())[0].config for step in few.steps]
     found = [(each.waveform.amplitude, each.waveform.frequency_hz) for each in loaded]
     assert found == [(1.0, 10.0), (1.0, 20.0), (2.0, 10.0), (2.0, 20.0)]
     assert {each.name for each in loaded} == {"few"}
@@ -24,31 +24,29 @@ def test_each_step_has_its_own_noise(campaign):
     more = CAMPAIGN.replace("[1.0, 2.0]", "[2.0, 0.5, 1.0]")
     for text in (CAMPAIGN, more, CAMPAIGN + "repeat: 2"):
         few = campaign(text)
-        loaded = [few.load(step, TextFiles()) for step in few.steps]
+        loaded = [few.load(step, TextFiles())[0] for step in few.steps]
         assert len({each.config.device["seed"] for each in loaded}) == len(loaded)
         texts[text] = {each.yaml_text for each in loaded}
     first, *others = texts.values()
     assert all(first <= other for other in others)
 
 
-def test_a_campaign_is_one_of_a_single_axis(campaign, experiment):
-    """Each axis alone, with its own noise; all of them together are refused with the cure."""
+def test_each_axis_has_its_own_noise(campaign, experiment):
     axes = "axes:\n  x: {device: {seed: 5}}\n  y: {device: {seed: 6}}\n"
     experiment.write_text(EXPERIMENT + axes)
     few = campaign()
-    with pytest.raises(ConfigError) as error:
-        few.load(few.steps[0], TextFiles())
-    assert [(each.key, each.hint) for each in error.value.problems] == [
-        ("axes", "add --set axis=x")
-    ]
-    each = campaign(CAMPAIGN + "  axis: [x, y]\n")
-    seeds = [each.load(step, TextFiles()).config.device["seed"] for step in each.steps]
+    loaded = [few.load(step, TextFiles()) for step in few.steps]
+    assert {tuple(axis.axis for axis in each) for each in loaded} == {("x", "y")}
+    seeds = [axis.config.device["seed"] for each in loaded for axis in each]
     assert len(seeds) == len(set(seeds)) == 8
+    varied = campaign(CAMPAIGN + "  axes.y.device.seed: [7, 8]\n")
+    x, y = varied.load(varied.steps[0], TextFiles())
+    assert (x.config.device["seed"] > 5, y.config.device["seed"]) == (True, 7)
 
 
 def test_seeds_that_are_varied_are_left_alone(campaign):
     few = campaign(CAMPAIGN + "  device.seed: [7, 8]\n")
-    seeds = [few.load(step, TextFiles()).config.device["seed"] for step in few.steps]
+    seeds = [few.load(step, TextFiles())[0].config.device["seed"] for step in few.steps]
     assert set(seeds) == {7, 8}
 
 
@@ -57,14 +55,14 @@ def test_reference_runs_come_first_now_and_then_and_last(campaign):
     assert [step.number for step in few.steps] == [*range(1, 8)]
     references = [step for step in few.steps if step.is_reference]
     assert [(step.number, step.repeat) for step in references] == [(1, 1), (4, 2), (7, 3)]
-    amplitudes = {few.load(step, TextFiles()).config.waveform.amplitude for step in references}
+    amplitudes = {few.load(step, TextFiles())[0].config.waveform.amplitude for step in references}
     assert amplitudes == {3.0}
 
 
 def test_whole_sections_and_the_condition(campaign):
     text = CAMPAIGN.replace("waveform.amplitude: [1.0, 2.0]", "compensator: [none]")
     few = campaign(text + "condition: {cycles: 4}\nset: {recording: {flush_s: 1.0}}\n", "block=10")
-    config = few.load(few.steps[0], TextFiles()).config
+    config = few.load(few.steps[0], TextFiles())[0].config
     assert (config.condition.cycles, config.recording.flush_s, config.block) == (4, 1.0, 10)
 
 
