@@ -58,6 +58,8 @@ def files(place):
     "learn um.yaml --output run.mcap",
     "characterise x.yaml --output x.yaml",
     "characterise x.yaml --output run.mcap",
+    "couple x.yaml --output x.yaml",
+    "couple x.yaml --output model.yaml --set=compensator.model=model.yaml",
     "export run.mcap run.csv",
     "report run.mcap --html run.mcap",
     "report run.mcap other.mcap --html other.mcap",
