@@ -292,13 +292,20 @@ def nearest_window_s(wanted_s: float) -> float:
 NO_PATH = np.empty((4, 0))
 
 
-def path_of(scopes: Sequence[Scope], window_s: float) -> F64:
+_POSITIONS = [ROW["reference"], ROW["displacement"]]
+
+
+def path_of(scopes: Sequence[Scope], window_s: float, rate_hz: float) -> F64:
     """Return the newest ``window_s`` of two axes of a run, the oldest samples first.
 
     Rows are reference and displacement of the first axis, then of the second one: float64[4, n].
+    All are of the same samples.
     """
-    newest = min(each.newest_position(window_s) for each in scopes)
-    return np.concatenate([each.positions(window_s, newest) for each in scopes])
+    traces = [each.densest(window_s) for each in scopes]
+    newest = min(each.newest for each in traces)
+    count = max(2, math.ceil(window_s * rate_hz / traces[0].width))
+    windows = [each.window(newest - count + 1, count) for each in traces]
+    return np.concatenate([each.first[_POSITIONS] for each in windows])
 
 
 def frame_of(scope: Scope, mode: ScopeMode, window_s: float, path: F64 = NO_PATH) -> bytes:

@@ -197,27 +197,10 @@ class Scope:
         t_s = np.arange(1 - count, 1) * (trace.width / self._rate_hz)
         return ScopeWindow(t_s.astype(np.float64), trace.window(trace.newest - count + 1, count))
 
-    def _dense(self, window_s: float) -> MinMaxTrace:
-        """Return the trace with the shortest buckets that contains ``window_s``."""
+    def densest(self, window_s: float) -> MinMaxTrace:
+        """Return the trace with the shortest buckets that stores ``window_s``."""
         samples = window_s * self._rate_hz
-        return next(
-            (each for each in self._rolling.values() if each.width * each.keep >= samples),
-            self._rolling[WINDOWS_S[-1]],
-        )
-
-    def newest_position(self, window_s: float) -> int:
-        """Return the number of the newest bucket of :meth:`positions`."""
-        return self._dense(window_s).newest
-
-    def positions(self, window_s: float, newest: int) -> F64:
-        """Return reference and displacement of the first sample of each bucket up to ``newest``.
-
-        float64[2, n], the oldest first; those of two scopes are of the same samples.
-        """
-        trace = self._dense(window_s)
-        count = min(trace.keep, max(2, math.ceil(window_s * self._rate_hz / trace.width)))
-        first = trace.window(newest - count + 1, count).first
-        return first[[ROW["reference"], ROW["displacement"]]]
+        return next(each for each in self._rolling.values() if each.width * each.keep >= samples)
 
     def whole_buckets(self, window_s: float, since: int) -> tuple[int, int, Buckets]:
         """Return the completed buckets of a rolling window from number ``since``.

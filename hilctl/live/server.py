@@ -437,7 +437,8 @@ class LiveServer:
         path = NO_PATH
         if view.across and view.up:
             feeds = [self._feeds.feed(view.run, axis) or shown for axis in (view.across, view.up)]
-            path = path_of([each.scope for each in feeds], nearest_window_s(view.path_s))
+            scopes, rate_hz = [each.scope for each in feeds], shown.description.sample_rate_hz
+            path = path_of(scopes, nearest_window_s(view.path_s), rate_hz)
         return frame_of(shown.scope, view.mode, nearest_window_s(view.window_s), path)
 
     def _status(self, feed: RunReader | None) -> str:

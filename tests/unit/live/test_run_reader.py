@@ -313,7 +313,7 @@ def test_a_path_is_of_the_same_samples(description, tmp_path):
         for ring, feed, blocks in zip(rings, feeds, (400, 380), strict=True):
             exchange(ring, range(blocks))
             feed.poll(1.0)
-        path = path_of([each.scope for each in feeds], 0.5)
+        path = path_of([each.scope for each in feeds], 0.5, 50e3)
         assert np.array_equal(path[:2], path[2:], equal_nan=True)
         newest = path[:, ~np.isnan(path[0])]
         assert 380 * 50 - 20 < newest[0, -1] <= 380 * 50

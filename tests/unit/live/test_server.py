@@ -30,7 +30,7 @@ from hilctl.live.server import (
     refusal,
 )
 from tests.fakes import SteppingClock
-from tests.unit.live.conftest import CONFIGS, active_run, first
+from tests.unit.live.conftest import CONFIGS, active_axes, active_run, exchange, first
 
 
 @pytest.fixture(autouse=True)
@@ -100,6 +100,29 @@ def test_page_gets_frames_and_status(description, tmp_path):
         status, frame = asyncio.run(seen())
         assert (status["run"], status["state"]) == (folder.card.name, "running")
     assert b'"signals": 6' in frame
+
+
+def test_page_gets_the_axis_and_the_path_of_its_view(description, tmp_path):
+    async def seen(ring):
+        async with serving() as server, opened(server) as connection:
+            await status_of(connection)
+            exchange(ring, range(4), spike_um=5.0)
+            view = {"axis": "y", "across": "y", "up": "x", "path_s": 0.1}
+            assert (await answer_to(connection, ask="view", view=view))["ok"]
+            while (status := await status_of(connection))["axis"] != "y":
+                pass
+            while isinstance(frame := await connection.recv(), str):
+                pass
+            assert (await answer_to(connection, ask="reset"))["ok"]
+            while (after := await status_of(connection))["peak_error"]["um"] is not None:
+                pass
+            return status, frame, after
+
+    with active_axes(description, tmp_path) as (_, rings):
+        status, frame, after = asyncio.run(asyncio.wait_for(seen(rings[1]), 20.0))
+    assert (status["axes"], status["peak_error"]["um"]) == (["x", "y"], 5.0)
+    assert b'"path": 0' not in frame
+    assert after["peak_error"]["since_s"] == pytest.approx(200 / 50e3)
 
 
 @pytest.mark.slow
