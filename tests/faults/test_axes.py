@@ -95,6 +95,39 @@ def test_a_file_that_is_lost_ends_the_run_and_keeps_what_is_in_memory(begun):
     assert run.kept
 
 
+FULL = """
+import os, sys
+from io import FileIO
+from hilctl.recording import writer
+from hilctl import cli
+
+class Full(FileIO):
+    def write(self, data):
+        if self.tell() > 100_000 and ".y." in os.readlink(f"/proc/self/fd/{self.fileno()}"):
+            raise OSError(28, "No space left on device")
+        return super().write(data)
+
+class Pending(writer.PendingFile):
+    def __init__(self, raw, **options):
+        super().__init__(Full(os.dup(raw.fileno()), "wb"), **options)
+
+writer.PendingFile = Pending
+sys.argv = ["hilctl", *sys.argv[1:]]
+sys.exit(cli.main())
+"""
+
+
+def test_a_full_disk_of_one_axis_loses_nothing(tmp_path):
+    """The run ends, and the next command completes the recording from memory."""
+    run = StartedRun(tmp_path, EXPERIMENT, program=("-c", FULL))
+    run.outputs = [tmp_path / f"run.{name}.mcap" for name in "xy"]
+    code, printed = run.ended()
+    assert code == 3
+    assert "No space left" in printed["reason"]
+    assert not any(each.kept for each in recover_dead_runs())
+    assert_complete(run, "stopped because the recording cannot be written")
+
+
 def test_status_marks_and_stop(begun):
     (run,) = runs()
     status = status_of(run)
