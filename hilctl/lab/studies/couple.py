@@ -137,11 +137,7 @@ class CouplingStudy:
         found: dict[str, dict[str, Lines]] = {axis: {} for axis in self._names}
         for axis, keys in motions.items():
             self._runs += 1
-            noise = [
-                f"axes.{each.loaded.axis}.{key}"
-                for each in self._axes
-                for key in each.loaded.noise_settings(self._runs)
-            ]
+            noise = [key for each in self._axes for key in each.loaded.noise_settings(self._runs)]
             settings = [*self._settings, *keys, *noise, *more]
             run = yield StudyStep(
                 self._experiment, settings, f"{axis}-{name}", f"crosstalk of {axis}, {name}",
