@@ -22,6 +22,7 @@ from hilctl.experiment.coil_heat import CoilHeat, cooled
 from hilctl.experiment.file import Experiment
 from hilctl.experiment.load import LoadedExperiment
 from hilctl.experiment.sections.compensator import CompensatorStart, InitialState, begin, left_by
+from hilctl.experiment.sections.coupling import coupling_sha256
 from hilctl.experiment.sections.limits import Limits
 from hilctl.experiment.state_files import (
     CoilState,
@@ -81,10 +82,12 @@ def start_of(
 def corrected_um(loaded: LoadedExperiment, reference: Reference) -> F64:
     """Return a reference with its learned correction, if the experiment has one: float64[n].
 
-    Raise InputError if the correction belongs to another rate, model or waveform.
+    Raise InputError if the correction belongs to another rate, model, waveform or coupling.
     """
     if loaded.correction is None:
         return reference.values
+    if loaded.correction.coupling_sha256 != coupling_sha256(loaded.coupling):
+        raise InputError("was learned without this coupling: it contains another crosstalk")
     return loaded.correction.added(reference, loaded.model)
 
 

@@ -28,7 +28,7 @@ from hilctl.base.subprocesses import python_command
 from hilctl.experiment.load import LoadedExperiment, input_files, load_axes, load_experiment
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun, check, check_axes
 from hilctl.experiment.sections.correction import dump_correction
-from hilctl.experiment.sections.coupling import dump_coupling
+from hilctl.experiment.sections.coupling import coupling_sha256
 from hilctl.machine.reserve import RESERVE
 from hilctl.models.model_file import dump_model
 from hilctl.recording.run_summary import read_ends
@@ -175,8 +175,8 @@ class RunKey:
         """Return the key of an experiment."""
         model = dump_model(loaded.model) if loaded.model else ""
         correction = dump_correction(loaded.correction) if loaded.correction else ""
-        coupling = dump_coupling(loaded.coupling) if loaded.coupling else ""
-        return cls(experiment_sha256(loaded), *map(sha256_of, (model, correction, coupling)))
+        digests = sha256_of(model), sha256_of(correction), coupling_sha256(loaded.coupling) or ""
+        return cls(experiment_sha256(loaded), *digests)
 
     @classmethod
     def of_facts(cls, run: Mapping[str, str]) -> Self:

@@ -7,6 +7,7 @@ import pytest
 
 from hilctl import api
 from hilctl.analysis.replay import replay
+from hilctl.base.errors import InputError
 from hilctl.experiment.sections.coupling import load_coupling
 from hilctl.recording.reader import read
 from tests.commands import hilctl
@@ -89,6 +90,24 @@ def test_circle_is_one_again(tmp_path, coupled, rig, frequency_hz):
     plain, decoupled = coupled(rig)
     assert contour_percent(tmp_path, frequency_hz, plain) >= 2.0
     assert contour_percent(tmp_path, frequency_hz, decoupled) <= 0.6
+
+
+@pytest.mark.parametrize("frequency_hz", [pytest.param(20.0, marks=pytest.mark.long), 120.0])
+@pytest.mark.parametrize("used", [False, True])
+def test_circle_is_learned_to_the_noise(tmp_path, coupled, frequency_hz, used):
+    """With a coupling or without; the corrections of one are refused by the other."""
+    plain, decoupled = coupled("a mode at 180 Hz")
+    settings, other = (decoupled, plain) if used else (plain, decoupled)
+    duration_s = round(0.4 + 20.0 / frequency_hz, 5)
+    circle = {"waveform.frequency_hz": frequency_hz, "waveform.duration_s": duration_s}
+    api.learn(STAGE, tmp_path / "circle.yaml", settings=settings | circle, fast=True)
+    files = {
+        f"axes.{axis}.compensator.correction": str(tmp_path / f"circle.{axis}.yaml")
+        for axis in "xy"
+    }
+    assert contour_percent(tmp_path, frequency_hz, settings | files) <= 0.15
+    with pytest.raises(InputError, match="coupling"):
+        api.check_axes(STAGE, settings=other | files | circle)
 
 
 def moved(folder, frequency_hz, moving, settings):

@@ -95,6 +95,7 @@ class Correction(StrictModel):
 
     sample_rate_hz: Annotated[float, Field(gt=0.0)]
     model_sha256: str  # digest of the compensator's model
+    coupling_sha256: str | None = None  # digest of the coupling in use; None: none
     cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]  # one per waveform
     # experiment, runs, identified delay, versions
     provenance: Mapping[str, str] = Field(default_factory=dict)

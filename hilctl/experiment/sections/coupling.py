@@ -9,6 +9,7 @@ moving averages over ``spacing`` samples (a cubic B-spline), so that a few of th
 resonance at a high sample rate.
 """
 
+import hashlib
 import math
 from collections.abc import Iterator, Mapping
 from pathlib import Path
@@ -197,6 +198,11 @@ def coupled_feedback_problems(
         rule = f"crosstalk below the crossover of PI feedback must be <= {MOST_WITH_PI:g}"
         value = f"{below.max():.2g} at {hz[below.argmax()]:.3g} Hz"
         yield broken("feedback", rule, value, "lower the bandwidth, or use feedback.kind integral")
+
+
+def coupling_sha256(coupling: Coupling | None) -> str | None:
+    """Return the digest of a coupling's file content; None without a coupling."""
+    return hashlib.sha256(dump_coupling(coupling).encode()).hexdigest() if coupling else None
 
 
 def load_coupling(path: Path, files: TextFiles | None = None) -> Coupling:

@@ -26,6 +26,7 @@ from hilctl.experiment.sections.correction import (
     signature,
     write_correction,
 )
+from hilctl.experiment.sections.coupling import coupling_sha256
 from hilctl.lab.ilc.cycle import CycleScore, cycle_error, harmonic_count
 from hilctl.lab.ilc.update import IlcIteration, IlcState, best_run, learn, refused
 from hilctl.lab.studies.study import StepStoppedError, Study, StudyRun, StudyStep
@@ -418,6 +419,7 @@ class IlcSession:
                 found[loaded.axis] = Correction(
                     sample_rate_hz=rate_hz,
                     model_sha256=model_sha256(loaded.model),
+                    coupling_sha256=coupling_sha256(loaded.coupling),
                     cycles=tuple(mine),
                     provenance=provenance,
                 )
