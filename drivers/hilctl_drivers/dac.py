@@ -83,6 +83,9 @@ class Dac(DacDevice):
             for name, each in devices.items()
             if isinstance(each, type(self)) and each.place == place
         }
+        readers = [each.own_reader for each in dacs.values() if each.own_reader]
+        if len(readers) > len(set(readers)):
+            return None  # each would open the link of the reader
         wires = [each.wire_on(link) for each in dacs.values()]
         joint = wires[0].joint(wires) if len(wires) > 1 else None
         return None if joint is None else JointDac(dacs, joint)
@@ -91,6 +94,12 @@ class Dac(DacDevice):
     def place(self) -> tuple[tuple[str, ...], int | None]:
         """Address of the device with the output, and its unit there."""
         return self._setup.writer.holds, self._setup.writer.unit
+
+    @property
+    def own_reader(self) -> tuple[str, ...]:
+        """Address of the device with the input, if it has a link of its own."""
+        setup = self._setup
+        return setup.reader.holds if setup.reads_elsewhere and not setup.shares_link else ()
 
     def wire_on(self, link: Link) -> Wire:
         """Return a new wire on a link."""

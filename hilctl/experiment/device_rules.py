@@ -2,13 +2,13 @@
 
 import math
 import re
-from collections.abc import Iterable, Iterator, Mapping
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from datetime import date
 from itertools import combinations
 from typing import Any
 
 from hilctl.base.axes import names_text
-from hilctl.base.device import AuxChannel, Device, DeviceInfo
+from hilctl.base.device import AuxChannel, Device, DeviceInfo, JointDevice
 from hilctl.base.errors import ConfigProblem, DeviceError, broken
 from hilctl.base.formatting import did_you_mean
 from hilctl.experiment.rig import RunRig
@@ -124,31 +124,39 @@ def output_problems(axes: Mapping[str, DeviceInfo]) -> Iterator[tuple[str, Confi
 
 
 def clock_problems(
-    axes: Mapping[str, DeviceInfo], rate_hz: float, block: int
+    axes: Mapping[str, DeviceInfo],
+    rate_hz: float,
+    block: int,
+    joints: Sequence[JointDevice] = (),
 ) -> Iterator[tuple[str, ConfigProblem]]:
     """Yield the broken rules on the devices of several axes on one clock, each with an axis.
 
-    Simulated devices step on the sample count: they have no clocks, and take no time.
+    Simulated devices step on the sample count: they have no clocks, and take no time. Those of a
+    joint device have one clock, and take the time of one exchange.
     """
     first, info = next(iter(axes.items()))
     for name, each in axes.items():
         if (each.buffered, each.latency_blocks) != (info.buffered, info.latency_blocks):
             yield name, broken("device", f"must have a FIFO and a latency as that of {first}")
     real = {name: each for name, each in axes.items() if not each.simulated}
-    clocks = {each.holds: name for name, each in real.items() if each.buffered}
+    turn_s = exchange_times_s(axes, joints)
+    clocks = [names for names in turn_s if real[names[0]].buffered]
     if len(clocks) > 1 and (block > 1 or info.latency_blocks):
-        rule = f"{names_text([*clocks.values()])} have clocks of their own, which drift apart"
+        names = names_text([*map(names_text, clocks)])
+        rule = f"{names} have clocks of their own, which drift apart"
         hint = "two outputs of one device may stream"
         if info.latency_blocks:
             yield first, broken("device", f"must not stream: {rule}", info.name, hint)
         else:
             yield first, broken("block", f"must be 1: {rule}", str(block), hint)
-    turn_s = [1.0 / each.max_rate_hz for each in real.values()]
-    if len(real) > 1 and rate_hz * sum(turn_s) > 1.0:
-        each_ms = list(dict.fromkeys(f"{1e3 * duration_s:.3g}" for duration_s in turn_s))
+    for joint in joints:
+        yield from ((joint.axes[0], each) for each in _joint_rate_problems(joint, rate_hz, block))
+    total_s = sum(turn_s.values())
+    if len(turn_s) > 1 and rate_hz * total_s > 1.0:
+        each_ms = list(dict.fromkeys(f"{1e3 * duration_s:.3g}" for duration_s in turn_s.values()))
         took = f"{names_text(each_ms)} ms{' each' if len(each_ms) == 1 else ''}"
-        hint = f"{names_text([*real])} are exchanged in turn, {took}"
-        rule = f"must be <= {_floor(1.0 / sum(turn_s)):g}"
+        hint = f"{names_text([*map(names_text, turn_s)])} are exchanged in turn, {took}"
+        rule = f"must be <= {_floor(1.0 / total_s):g}"
         yield first, broken("sample_rate_hz", rule, f"{rate_hz:g}", hint)
     arm_s, tick_s = sum(each.arm_s for each in real.values()), block / rate_hz
     for name, each in real.items():
@@ -160,14 +168,80 @@ def clock_problems(
             yield name, broken("device.watchdog.timeout_s", rule, f"{timeout_s:g}")
 
 
-def link_problems(axes: Mapping[str, DeviceInfo]) -> Iterator[tuple[str, ConfigProblem]]:
-    """Yield the axes whose device shares its link with that of an earlier one."""
+def exchange_times_s(
+    axes: Mapping[str, DeviceInfo], joints: Sequence[JointDevice]
+) -> dict[tuple[str, ...], float]:
+    """Return the time of each exchange of real devices, in their order, by the axes that it has."""
+    found: dict[tuple[str, ...], float] = {}
+    of_axis = {name: joint for joint in joints for name in joint.axes}
+    for name, info in axes.items():
+        if not info.simulated:
+            joint = of_axis.get(name)
+            names = (name,) if joint is None else tuple(joint.axes)
+            found[names] = 1.0 / (info if joint is None else joint).max_rate_hz
+    return found
+
+
+def _joint_rate_problems(joint: JointDevice, rate_hz: float, block: int) -> Iterator[ConfigProblem]:
+    """Yield a rate or a block that a joint device does not support."""
+    names = names_text(joint.axes)
+    if rate_hz > joint.max_rate_hz:
+        rule = f"must be <= {joint.max_rate_hz:g}, the highest rate of {names} together"
+        yield broken("sample_rate_hz", f"{rule} ({joint.rate_note})", f"{rate_hz:g}")
+        return
+    try:
+        joint.check_rate(rate_hz, block)
+    except DeviceError as error:
+        rule = f"must allow sample_rate_hz for {names} together, which a larger block does: {error}"
+        yield broken("block", rule, str(block))
+
+
+def link_problems(
+    axes: Mapping[str, DeviceInfo], joints: Sequence[JointDevice] = ()
+) -> Iterator[tuple[str, ConfigProblem]]:
+    """Yield the axes whose device shares its link with that of an earlier one.
+
+    Those of a joint device may, but it has one watchdog.
+    """
+    together = {frozenset(pair) for joint in joints for pair in combinations(joint.axes, 2)}
     for (first, one), (second, other) in combinations(axes.items(), 2):
         shared = sorted(set(one.holds) & set(other.holds))
-        if shared and one.output != other.output:
+        if not shared or one.output == other.output:
+            continue
+        if frozenset((first, second)) not in together:
             rule = f"must have a link of its own: {shared[0]} is that of {first}"
             hint = f"--set axis={second} runs this one alone"
             yield second, broken("device", rule, other.name, hint)
+        elif one.watchdog_timeout_s != other.watchdog_timeout_s:
+            rule = f"must be that of {first}: both outputs have the one watchdog of their device"
+            key = "device.watchdog.timeout_s" if other.watchdog_timeout_s else "device.watchdog"
+            yield second, broken(key, rule)
+
+
+def skew_notes(
+    turn_s: Mapping[tuple[str, ...], float], speeds_um_per_s: Mapping[str, float], least_um: float
+) -> Iterator[str]:
+    """Yield how far axes leave the path because they are exchanged later, if that is much.
+
+    Args:
+        turn_s: Time of each exchange, see :func:`exchange_times_s`.
+        speeds_um_per_s: Highest speed of each axis that has a path in um.
+        least_um: Largest distance that is not worth a note.
+    """
+    if not turn_s:
+        return
+    (first, *_), *others = turn_s
+    late_s = 0.0
+    for names, before_s in zip(others, turn_s.values(), strict=False):
+        late_s += before_s
+        for name in names:
+            apart_um = late_s * speeds_um_per_s.get(name, 0.0)
+            if apart_um > least_um:
+                yield (
+                    f"{name} is exchanged {1e3 * late_s:.2g} ms after {first}: up to "
+                    f"{apart_um:.2g} um apart from the path at this speed. Use one device for both,"
+                    " or a lower speed"
+                )
 
 
 def _floor(value: float) -> float:

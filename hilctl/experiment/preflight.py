@@ -8,10 +8,12 @@ import logging
 from collections.abc import Callable, Iterable, Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from typing import cast
 
 import numpy as np
 
 from hilctl.base.axes import problems_of_axes
+from hilctl.base.device import JointDevice, joined
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
@@ -20,9 +22,11 @@ from hilctl.experiment.device_rules import (
     channel_problems,
     clock_problems,
     crosstalk_problems,
+    exchange_times_s,
     link_problems,
     output_problems,
     rate_problems,
+    skew_notes,
     watchdog_problems,
 )
 from hilctl.experiment.device_state import corrected_um, heat_before, start_of
@@ -75,6 +79,7 @@ from hilctl.waveforms.build import Reference, build
 _log = logging.getLogger(__name__)
 
 _MANY = 50_000_000  # samples, which take some seconds
+_NOTED_SKEW = 1e-3  # of the longest path
 
 
 @shown_briefly
@@ -202,7 +207,8 @@ def check_axes(loaded: Sequence[LoadedExperiment], heat_a2: float | None = 0.0) 
             lambda one: check(one, heat_a2, now, max(samples), crosstalk_um.get(one.axis)),
         )
     limits = {each.axis: each.config.command_limits() for each in loaded}
-    return CheckedRun(tuple(axes), (*notes, *apart_notes(loaded[0].config.apart, limits)))
+    notes += [*apart_notes(loaded[0].config.apart, limits), *_skew_notes(axes)]
+    return CheckedRun(tuple(axes), (*notes,))
 
 
 def _checked_each(
@@ -244,12 +250,30 @@ def _joint_problems(loaded: Sequence[LoadedExperiment]) -> Iterator[ConfigProble
     models = {each.axis: each.model for each in loaded}
     coupled = coupling_problems(loaded[0].coupling, models, config.sample_rate_hz)
     yield from loaded[0].document.refusal(coupled).problems
-    found = [*output_problems(infos), *link_problems(infos)]
+    joints = _joints(loaded)
+    found = [*output_problems(infos), *link_problems(infos, joints)]
     found += crosstalk_problems({each.axis: each.config.device for each in loaded})
-    found += clock_problems(infos, config.sample_rate_hz, config.block)
+    found += clock_problems(infos, config.sample_rate_hz, config.block, joints)
     found += [(loaded[0].axis, each) for each in apart_problems(config.apart, [*infos])]
     for axis, problem in found:
         yield from documents[axis].refusal([problem]).problems
+
+
+def _joints(loaded: Sequence[LoadedExperiment]) -> list[JointDevice]:
+    """Return the joint devices among those of the axes; they exchange real devices at once."""
+    units = joined({each.axis: each.device for each in loaded if not each.device.info.simulated})
+    return [cast(JointDevice, unit) for names, unit in units.items() if len(names) > 1]
+
+
+def _skew_notes(axes: Sequence[CheckedExperiment]) -> Iterator[str]:
+    """Yield how far the axes leave the path because they are exchanged in turn."""
+    loaded = [each.loaded for each in axes]
+    infos = {each.axis: each.device.info for each in loaded}
+    paths = [each for each in axes if each.reference.unit == "um"]
+    speeds = {each.loaded.axis: each.reference.speed for each in paths}
+    spans_um = [each.reference.span[1] - each.reference.span[0] for each in paths]
+    least_um = _NOTED_SKEW * max(spans_um, default=0.0)
+    yield from skew_notes(exchange_times_s(infos, _joints(loaded)), speeds, least_um)
 
 
 def check(

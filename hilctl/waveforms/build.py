@@ -154,6 +154,12 @@ class Reference:
         """Representative parts: all of it except most periods of long periodic parts."""
         return telling(self.values.size, self.repeats)
 
+    @property
+    def speed(self) -> float:
+        """Fastest change, in ``unit`` per s."""
+        steps = (np.abs(np.diff(self.values[each])) for each in self.telling)
+        return self.sample_rate_hz * max(float(each.max(initial=0.0)) for each in steps)
+
     def held(self, samples: int) -> "Reference":
         """Return the reference with its last value repeated up to a number of samples."""
         if (more := samples - self.values.size) <= 0:

@@ -6,9 +6,15 @@ from pathlib import Path
 import pytest
 
 from hilctl.base.axes import axis_documents, with_settings
-from hilctl.base.errors import ConfigError
+from hilctl.base.errors import ConfigError, DeviceError
 from hilctl.base.yaml import Document
-from hilctl.experiment.device_rules import clock_problems, link_problems, output_problems
+from hilctl.experiment.device_rules import (
+    clock_problems,
+    exchange_times_s,
+    link_problems,
+    output_problems,
+    skew_notes,
+)
 from hilctl.experiment.load import input_files, inputs_of, load_axes, load_experiment
 from hilctl.experiment.preflight import check_axes
 
@@ -235,21 +241,76 @@ def test_axes_on_one_link_are_refused(real):
     assert not [*link_problems(real | {"y": replace(real["y"], holds=("tcp:other",))})]
 
 
+class Together:
+    """A joint device, for the rules."""
+
+    axes = ("x", "y")
+    max_rate_hz = 900.0
+    rate_note = "a note"
+
+    def check_rate(self, rate_hz, block):
+        if block < 5 and rate_hz > 800.0:
+            raise DeviceError("too fast")
+
+
+def test_joined_axes_share_a_link_a_clock_and_the_time_of_an_exchange(real):
+    def keys(rate_hz, block=1, more=()):
+        infos = {**fifo, **dict(more)}
+        return [each.key for _, each in clock_problems(infos, rate_hz, block, [Together()])]
+
+    assert not [*link_problems(real, [Together()])]
+    fifo = {name: replace(each, buffered=True) for name, each in real.items()}
+    assert keys(800.0, 50) == []
+    assert keys(850.0, 2) == ["block"]
+    assert keys(950.0, 50) == ["sample_rate_hz"]
+    other = {"z": replace(fifo["x"], holds=("tcp:other",), max_rate_hz=100.0)}
+    assert keys(95.0, more=other) == ["sample_rate_hz"]
+    assert keys(85.0, more=other) == []
+    assert keys(10.0, 2, other) == ["block"]
+    of_axes = exchange_times_s({**fifo, **other}, [Together()])
+    assert of_axes == {("x", "y"): pytest.approx(1.0 / 900.0), ("z",): 0.01}
+
+
+def test_joined_axes_have_one_watchdog(real):
+    watched = {name: replace(each, watchdog_timeout_s=2.0) for name, each in real.items()}
+    assert not [*link_problems(watched, [Together()])]
+    for own, key in ((None, "device.watchdog"), (3.0, "device.watchdog.timeout_s")):
+        infos = watched | {"y": replace(real["y"], watchdog_timeout_s=own)}
+        ((axis, problem),) = link_problems(infos, [Together()])
+        assert (axis, problem.key) == ("y", key)
+
+
+def test_axes_that_are_exchanged_later_are_noted_if_they_leave_the_path():
+    turn_s = {("x", "y"): 1e-3, ("z",): 2e-3, ("w",): 1e-3}
+    speeds = {"x": 9e9, "y": 9e9, "z": 1000.0, "w": 1000.0}
+    notes = [*skew_notes(turn_s, speeds, 1.5)]
+    assert [each.split()[0] for each in notes] == ["w"]
+    assert "3 ms after x" in notes[0]
+    assert "3 um" in notes[0]
+    assert not [*skew_notes({}, speeds, 0.0)]
+
+
 def test_simulated_axes_take_no_time():
     infos = {each.axis: each.device.info for each in load_axes(STAGE)}
     assert not [*clock_problems(infos, 200000.0, 50)]
 
 
-def test_real_axes_are_refused_together_and_run_alone(tmp_path):
-    text = (CONFIGS / "modbus_labjack_t7.yaml").read_text(encoding="utf-8")
+def test_two_outputs_of_one_device_are_axes_of_one_run(tmp_path):
     path = CONFIGS / "modbus_labjack_t7.yaml"
-    assert "axes" not in text
     (tmp_path / "models").symlink_to(CONFIGS / "models")
-    own = tmp_path / "t7.yaml"
+    own, text = tmp_path / "t7.yaml", path.read_text(encoding="utf-8")
     own.write_text(text + "axes:\n  x: {}\n  y: {device: {output: DAC1}}\n", encoding="utf-8")
-    (problem,) = refused(own)
-    assert problem.key == "device"
+    checked = check_axes(load_axes(own))
+    assert checked.names == ["x", "y"]
+    assert not checked.notes
     assert load_experiment(own, ["axis=x"]).config == load_experiment(path).config
+    apart = ["axes.y.device.tcp_port=5021"]
+    (note,) = check_axes(load_axes(own, apart)).notes
+    assert note.startswith("y is exchanged 1 ms after x")
+    (problem,) = refused(own, *apart, "sample_rate_hz=501")
+    assert problem.key == "sample_rate_hz"
+    (problem,) = refused(own, "axes.y.device.output=DAC0")
+    assert problem.key == "device.output"
 
 
 @pytest.mark.parametrize("named", ["z", "x"])
