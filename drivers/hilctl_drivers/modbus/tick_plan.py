@@ -241,19 +241,17 @@ class Tick:
 
     def reader(self, source: ModbusInput) -> Callable[[], float]:
         """Return a function that returns an input by the last replies; NaN if it is invalid."""
-        own, decode = self._content(source), source.format.decode
-        if source.validity == "none":
-            return lambda: decode(own())
-        other, bits = self._content(source.validity), source.validity.bits
-        valid = source.validity.valid
-        return lambda: decode(own()) if bits(other()) == valid else math.nan
+        replies, (k, part) = self._replies, self._place(source)
+        decode, validity = source.format.decode, source.validity
+        if validity == "none":
+            return lambda: decode(replies[k][part])
+        bits, valid, (n, other) = validity.bits, validity.valid, self._place(validity)
+        return lambda: decode(replies[k][part]) if bits(replies[n][other]) == valid else math.nan
 
-    def _content(self, register: Register) -> Callable[[], bytes]:
-        """Return a function that returns the bytes of a register in the last replies."""
-        replies, place = self._replies, self.plan.place(register)
+    def _place(self, register: Register) -> tuple[int, slice]:
+        place = self.plan.place(register)
         assert place is not None, "the plan reads it"
-        k, part = place
-        return lambda: replies[k][part]
+        return place
 
 
 def _filler(plan: TickPlan, request: Request) -> Callable[[Sequence[bytes]], bytes] | None:
