@@ -5,6 +5,7 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import TypeAlias
 
+from hilctl.base.errors import InputError
 from hilctl.base.files import already_there
 
 PathLike: TypeAlias = str | os.PathLike[str]
@@ -16,6 +17,16 @@ def paths_of(paths: Paths) -> list[Path]:
     if isinstance(paths, str | os.PathLike):
         return [Path(paths)]
     return [Path(each) for each in paths]
+
+
+def experiment_path(experiment: PathLike) -> Path:
+    """Return the path of an experiment; raise InputError if it is not one, such as a mapping."""
+    if isinstance(experiment, str | os.PathLike):
+        return Path(experiment)
+    raise InputError(
+        f"experiment must be the path of a file, got {type(experiment).__name__}: write the file, "
+        "and override its keys with settings"
+    )
 
 
 def path_or_none(path: PathLike | None) -> Path | None:

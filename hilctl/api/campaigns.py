@@ -5,7 +5,7 @@ from contextlib import nullcontext
 from datetime import UTC, datetime
 from pathlib import Path
 
-from hilctl.api._types import PathLike, path_or_none, runs_folder
+from hilctl.api._types import PathLike, experiment_path, path_or_none, runs_folder
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable, is_folder, write_text
 from hilctl.base.table import Column
@@ -113,7 +113,7 @@ def calibrate_amplifier(
         InputError: An input is invalid, or a file cannot be written; nothing has moved.
         RunError: The run ended early.
     """
-    path, texts, file = Path(experiment), texts_of(settings), Path(output)
+    path, texts, file = experiment_path(experiment), texts_of(settings), Path(output)
     origin = Origin(datetime.now(UTC).date(), by, reference)
     before = existing_calibration(file, "amplifier", overwrite=overwrite)
     finish_dead_runs()
@@ -165,13 +165,13 @@ def characterise(
     file, chosen = Path(output), runs_folder(output, folder)
     page = file.with_suffix(".html")
     if page == file:
-        raise InputError(f"{file}: is the name of the page: choose another --output, such as .yaml")
+        raise InputError(f"{file}: is the name of the page: choose another output, such as .yaml")
     host = StudyHost.of(fast=fast, on_progress=on_progress, on_step=on_step)
     measured = CharacterisationRunner(
-        Path(experiment), texts_of(settings), chosen, highest_hz, host
+        experiment_path(experiment), texts_of(settings), chosen, highest_hz, host
     )
     if not dry_run:
-        inputs = inputs_of(Path(experiment), texts_of(settings))
+        inputs = inputs_of(experiment_path(experiment), texts_of(settings))
         check_writable(file, overwrite=overwrite, inputs=inputs)
         again = overwrite or bool(recordings_in(chosen))
         check_writable(page, overwrite=again, inputs=inputs)
@@ -220,12 +220,12 @@ def couple(
         RunError: A run ended by a fault, or a crosstalk is not a linear response.
     """
     file, chosen = Path(output), runs_folder(output, folder)
-    inputs = inputs_of(Path(experiment), texts_of(settings))
+    inputs = inputs_of(experiment_path(experiment), texts_of(settings))
     check_writable(file, overwrite=overwrite, inputs=inputs)
     for path in recordings_in(chosen):
         check_no_input(path, inputs)
     finish_dead_runs()
-    coupled = CouplingStudy(Path(experiment), texts_of(settings), chosen, highest_hz)
+    coupled = CouplingStudy(experiment_path(experiment), texts_of(settings), chosen, highest_hz)
     host = StudyHost.of(fast=fast, on_progress=on_progress)
     with prepared(chosen, host.sleep_s, host.on_note):
         found = run_study(
@@ -318,8 +318,8 @@ def learn(
         InputError: An input is invalid, or a file cannot be written; nothing has moved.
     """
     chosen = runs_folder(output, folder)
-    inputs = inputs_of(Path(experiment), texts_of(settings))
-    session = IlcSession(Path(experiment), texts_of(settings), chosen)
+    inputs = inputs_of(experiment_path(experiment), texts_of(settings))
+    session = IlcSession(experiment_path(experiment), texts_of(settings), chosen)
     files = recordings_of(session.axes, Path(output))
     for file in files.values():
         check_writable(file, overwrite=overwrite, inputs=inputs)
@@ -327,7 +327,7 @@ def learn(
     for path in runs:
         check_no_input(path, inputs)
     if not overwrite and any(path.suffix == ".mcap" for path in runs):
-        raise InputError(f"{chosen}: contains runs: choose another --folder, or use --overwrite")
+        raise InputError(f"{chosen}: contains runs: choose another folder, or overwrite")
     host = StudyHost.of(fast=fast)
     with prepared(chosen, host.sleep_s, host.on_note):
         learned = run_study(session.study(cycles, on_rows), chosen, host, resume=False)

@@ -6,7 +6,7 @@ from datetime import UTC, datetime
 from functools import cached_property
 from pathlib import Path
 
-from hilctl.api._types import PathLike, Paths, path_or_none, paths_of
+from hilctl.api._types import PathLike, Paths, experiment_path, path_or_none, paths_of
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable, write_text
 from hilctl.base.formatting import shown_briefly
@@ -87,7 +87,7 @@ def _request(
     """Return a fit to files, and how their tables were read."""
     loaded, unit = load_records(paths, settings, lag_samples), settings.table.unit
     if loaded.unit and unit and loaded.unit != unit:
-        raise InputError(f"--unit must be {loaded.unit}, the unit of the files (got {unit})")
+        raise InputError(f"the unit must be {loaded.unit}, that of the files (got {unit})")
     every = settings.model_copy(update={"leave_out": ()})
     held_out = load_records(validate, every, lag_samples).records
     request = FitRequest(
@@ -259,7 +259,7 @@ def compare(
     """
     inputs = [*paths_of(recordings), *map(Path, models)]
     if experiment is not None:
-        inputs += inputs_of(Path(experiment), texts_of(settings))
+        inputs += inputs_of(experiment_path(experiment), texts_of(settings))
     if html is not None:
         check_writable(Path(html), overwrite=overwrite, inputs=inputs)
     if save is not None:

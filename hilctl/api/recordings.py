@@ -58,6 +58,10 @@ class RecordedRun:
         """Samples as named columns: ``sample``, ``t_s``, the recorded signals, ``flags``."""
         return SampleTable(columns(self.recording), units(self.recording))
 
+    def to_pandas(self) -> Any:
+        """Return the samples as a ``pandas.DataFrame``, see :meth:`SampleTable.to_pandas`."""
+        return self.table.to_pandas()
+
 
 def read(path: PathLike, *, from_s: float | None = None, to_s: float | None = None) -> RecordedRun:
     """Read a recording into memory.

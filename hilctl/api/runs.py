@@ -4,7 +4,7 @@ from collections.abc import Callable, Mapping
 from dataclasses import dataclass
 from pathlib import Path
 
-from hilctl.api._types import PathLike, path_or_none
+from hilctl.api._types import PathLike, experiment_path, path_or_none
 from hilctl.base.device import DeviceInfo
 from hilctl.base.files import already_there, exists, write_text
 from hilctl.base.types import CommandUnit
@@ -76,7 +76,7 @@ def default_path(device: str) -> Path:
 def refuse_existing(path: Path) -> None:
     """Raise :class:`hilctl.base.errors.InputError` if a file exists."""
     if exists(path):
-        raise already_there(path, "choose another --output")
+        raise already_there(path, "choose another output")
 
 
 def is_set(key: str, texts: list[str]) -> bool:
@@ -95,7 +95,7 @@ def load(experiment: PathLike, settings: Settings = ()) -> LoadedExperiment:
     Raises:
         InputError: The experiment is invalid; the error lists all problems.
     """
-    return load_experiment(Path(experiment), texts_of(settings))
+    return load_experiment(experiment_path(experiment), texts_of(settings))
 
 
 def check(experiment: PathLike, settings: Settings = ()) -> CheckedExperiment:
@@ -108,7 +108,7 @@ def check(experiment: PathLike, settings: Settings = ()) -> CheckedExperiment:
     Raises:
         InputError: The experiment cannot run; the error lists all problems.
     """
-    return checked_experiment(Path(experiment), texts_of(settings))
+    return checked_experiment(experiment_path(experiment), texts_of(settings))
 
 
 def check_axes(experiment: PathLike, settings: Settings = ()) -> CheckedRun:
@@ -124,7 +124,7 @@ def check_axes(experiment: PathLike, settings: Settings = ()) -> CheckedRun:
     Raises:
         InputError: The experiment cannot run; the error lists all problems.
     """
-    return checked_run(Path(experiment), texts_of(settings))
+    return checked_run(experiment_path(experiment), texts_of(settings))
 
 
 def run(
@@ -158,7 +158,7 @@ def run(
         InputError: The experiment cannot run; nothing has moved, and no file is left.
         RunError: The device could not be opened; nothing has moved, and no file is left.
     """
-    path, texts, chosen = Path(experiment), texts_of(settings), path_or_none(output)
+    path, texts, chosen = experiment_path(experiment), texts_of(settings), path_or_none(output)
     if not fast:
         return start_run(path, texts, chosen, overwrite, on_progress, take_over=take_over)
     checked = checked_run(path, texts)

@@ -9,7 +9,7 @@ from typing import TYPE_CHECKING, Any
 
 from hilctl.analysis.catalogue import Entry, keys_of
 from hilctl.base.errors import InputError
-from hilctl.base.formatting import printable, short_name
+from hilctl.base.formatting import did_you_mean, printable, short_name
 from hilctl.recording.metadata_keys import LABELS_FACT
 
 if TYPE_CHECKING:
@@ -40,7 +40,10 @@ _UNITS = {"hz": "Hz", "s": "s", "ns": "ns", "um": "um", "percent": "%", "bytes":
 
 
 class SampleTable(Mapping[str, "npt.NDArray[Any]"]):
-    """Samples as named columns of equal length; ``table["displacement_um"]`` is an array.
+    """Samples as a mapping of columns of equal length; ``table["displacement_um"]`` is an array.
+
+    As in a mapping, ``len(table)`` is the number of columns, and iteration yields their names;
+    :attr:`rows` is the number of samples, and ``table["displacement_um"][:5]`` selects some.
 
     Args:
         columns: The columns.
@@ -52,7 +55,12 @@ class SampleTable(Mapping[str, "npt.NDArray[Any]"]):
         self.units = dict(units)
 
     def __getitem__(self, name: str) -> "npt.NDArray[Any]":
-        return self._columns[name]
+        """Return a column; raise KeyError with a similar name, TypeError for rows."""
+        if isinstance(name, str):
+            if name in self._columns:
+                return self._columns[name]
+            raise KeyError(f"no column {name!r} ({did_you_mean(name, self._columns)})")
+        raise TypeError("choose a column by its name, then its rows: table['t_s'][:5]")
 
     def __iter__(self) -> Iterator[str]:
         return iter(self._columns)
@@ -62,7 +70,12 @@ class SampleTable(Mapping[str, "npt.NDArray[Any]"]):
 
     def __repr__(self) -> str:
         named = (f"{name} [{self.units[name]}]" if name in self.units else name for name in self)
-        return f"<{self.rows} samples: {', '.join(named)}>"
+        return f"<mapping of {len(self)} columns, {self.rows} samples each: {', '.join(named)}>"
+
+    @property
+    def columns(self) -> list[str]:
+        """Names of the columns."""
+        return list(self._columns)
 
     @property
     def rows(self) -> int:

@@ -140,7 +140,7 @@ def _problems(document: Document) -> Iterator[ConfigProblem]:
 def _shadowed(document: Document, parts: dict[str, Document]) -> Iterator[ConfigProblem]:
     """Yield the settings without effect, because each axis sets their key."""
     for assignment in document.assignments:
-        where, loc = f"--set {assignment}", _loc_in(assignment)
+        where, loc = f"setting {assignment}", _loc_in(assignment)
         places = [part.where(loc) for part in parts.values()]
         if loc[0] != "axes" and document.where(loc) == where and where not in places:
             rule, name = "has no effect, because each axis sets this key", next(iter(parts))

@@ -202,7 +202,7 @@ def _written(path: Path, *, overwrite: bool) -> Iterator[AtomicFile]:
         with AtomicFile(path, overwrite=overwrite) as file:
             yield file
     except FileExistsError:
-        raise already_there(path, "use another name, or --overwrite") from None
+        raise already_there(path, "choose another name, or overwrite") from None
     except FileNotFoundError as error:
         lost = "" if path.parent.is_dir() else f" (there is no folder {path.parent})"
         raise InputError(f"{path}: cannot be written: {error.strerror}{lost}") from None

@@ -469,7 +469,7 @@ class Document:
             mapping[key.value] = self._build(value, inner, place)
         return mapping
 
-    def set(self, assignment: str, option: str = "--set") -> None:
+    def set(self, assignment: str, option: str = "setting") -> None:
         """Apply one ``dotted.key=value`` of a command line's option; the value is YAML.
 
         A section that is ``none`` becomes a mapping.

@@ -92,11 +92,6 @@ class RingHost:
         self._numbers = self._page.numbers
         self._supervisor = supervisor
         self._silence_ns = silence_s * 1e9
-        self._silent = (
-            f"stopped because the supervisor was silent for {silence_s:g} s, half of "
-            "recording.ring_s: the computer is too busy to run it, or it was suspended; "
-            "end other programs, or raise recording.ring_s"
-        )
 
     def heartbeat(self, next_sample: int, late_ticks: int) -> str:
         """Write the heartbeat; return the reason to stop, or an empty text."""
@@ -110,8 +105,17 @@ class RingHost:
         if not self.supervised():
             return "stopped because the supervisor died"
         if now_ns - numbers[_SUPERVISOR_HEARTBEAT_NS] > self._silence_ns:
-            return self._silent
+            return self._silent(next_sample, late_ticks)
         return ""
+
+    def _silent(self, next_sample: int, late_ticks: int) -> str:
+        """Return how busy the computer is, and whether the loop itself was in time."""
+        return (
+            f"stopped because the supervisor was silent for {1e-9 * self._silence_ns:g} s, half of "
+            f"recording.ring_s: the computer is too busy (load {os.getloadavg()[0]:.1f} on "
+            f"{os.cpu_count()} CPUs; the loop was late in {late_ticks} ticks up to sample "
+            f"{next_sample}). End other programs, or raise recording.ring_s"
+        )
 
     def starts_at(self, time_ns: int) -> None:
         """Write the time of the first tick, and the phase that lets watchers read it."""

@@ -88,7 +88,7 @@ class Recorder:
         try:
             self._file = OutputFile(path, overwrite=overwrite, sync=config.recording.sync)
         except FileExistsError:
-            raise already_there(path, "give another --output, or --overwrite") from None
+            raise already_there(path, "choose another output, or overwrite") from None
         except OSError as error:
             raise InputError(self._cannot(reason(error))) from None
 

@@ -69,13 +69,16 @@ def output_of(run: CheckedRun, output: Path | None) -> Path:
     """Return the recording to write: ``output``, or a new name in the folder of recordings.
 
     Those of several axes are named after it, see :func:`recordings_of`. Raise InputError if the
-    folder cannot be created, or a recording is an input of the run.
+    folder cannot be created, or a recording is an input of the run or not an ``.mcap`` file.
     """
     if output is not None:
         for path in recordings_of(run.names, output).values():
             for loaded in (each.loaded for each in run.axes):
                 # A recording may be an input: of a waveform, or of the initial state.
                 check_no_input(path, input_files(loaded.document, loaded.folder / "experiment"))
+        if output.suffix.lower() != ".mcap":
+            rule = "a recording is an MCAP file: choose a name that ends with .mcap"
+            raise InputError(f"{output}: {rule} (hilctl export writes samples as tables)")
         return output
     folder = Path(run.config.recording.folder)
     make_folder(folder)

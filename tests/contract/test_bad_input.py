@@ -161,7 +161,7 @@ def test_binary_experiment(refused_everywhere, place):
 ])  # fmt: skip
 def test_setting(refused_everywhere, place, setting, message):
     (place / "x.yaml").write_text(GOOD)
-    refused_everywhere(f"--set {setting}: {message}", "x.yaml", "--set", setting)
+    refused_everywhere(f"setting {setting}: {message}", "x.yaml", "--set", setting)
 
 
 def test_every_problem_is_told(hilctl, place):
@@ -193,7 +193,7 @@ def outputs(place):
 @pytest.mark.parametrize(("output", "message"), [
     ("lost/run.mcap", "lost/run.mcap: cannot be written: No such file or directory"),
     ("regular/run.mcap", "regular/run.mcap: cannot be written: Not a directory"),
-    ("x" * 300, "cannot be written: File name too long"),
+    ("x" * 300 + ".mcap", "cannot be written: File name too long"),
     ("runs", "runs: "),
 ])  # fmt: skip
 def test_unwritable_recording(refused, output, message, overwrite):
@@ -209,8 +209,8 @@ def test_output_that_is_no_file(refused, place, name):
 
 @pytest.mark.usefixtures("outputs")
 @pytest.mark.parametrize(("words", "message"), [
-    ((), "run.mcap: exists already: give another --output, or --overwrite"),
-    (("--overwrite", "--set", "block=0"), "--set block=0: block: must be >= 1, got 0"),
+    ((), "run.mcap: exists already: choose another output, or overwrite"),
+    (("--overwrite", "--set", "block=0"), "setting block=0: block: must be >= 1, got 0"),
 ])  # fmt: skip
 def test_existing_recording_is_kept(refused, words, message):
     refused(message, "run", "x.yaml", "--output", "run.mcap", *words)

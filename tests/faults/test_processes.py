@@ -119,6 +119,7 @@ def test_silent_supervisor_ends_the_run(tmp_path):
     returned, printed = run.ended()
     assert returned == 3
     assert "supervisor was silent for 2.5 s" in printed["reason"]
+    assert "CPUs; the loop was late in" in printed["reason"]
     recording = read(run.output)
     assert contiguous(recording)
     assert recording.dropped == 0

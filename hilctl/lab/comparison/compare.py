@@ -236,7 +236,7 @@ def check_free(
         check_no_input(path, inputs)
     taken = [path for path in paths if exists(path)]
     if taken and not overwrite:
-        raise already_there(taken[0], "choose another --save, or --overwrite")
+        raise already_there(taken[0], "choose another folder to save, or overwrite")
 
 
 def save_models(comparison: Comparison, folder: Path, *, created: str, overwrite: bool) -> None:

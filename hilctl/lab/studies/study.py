@@ -286,8 +286,8 @@ class _Engine:
         axis, there = next(iter(recordings_of([*keys], file).items()))
         if step.replaces and not self.moved and completed_key(there) not in {None, keys[axis]}:
             raise InputError(
-                f"{there} was recorded with other settings: restore them, choose another --folder, "
-                "or replace all recordings with --overwrite"
+                f"{there} was recorded with other settings: restore them, choose another folder, "
+                "or overwrite all recordings"
             )
         return None
 

@@ -65,5 +65,5 @@ def test_learning_keeps_its_runs_and_writes_a_correction(tmp_path):
     assert (tmp_path / "c-runs" / "run-00.mcap").exists()
     with pytest.raises(InputError, match="exists"):
         api.learn(learnable, file, fast=True)
-    with pytest.raises(InputError, match="--folder"):
+    with pytest.raises(InputError, match="another folder"):
         api.learn(learnable, tmp_path / "c.yml", folder=tmp_path / "c-runs", fast=True)

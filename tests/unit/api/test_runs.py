@@ -36,6 +36,19 @@ def test_the_default_output_is_in_the_folder_of_the_experiment(tmp_path):
     assert api.list_runs(tmp_path)[0]["name"] == "terfenol_sine_6a_uncompensated"
 
 
+@pytest.mark.parametrize("use", [api.run, api.check, api.check_axes, api.load])
+def test_a_mapping_is_no_experiment(use):
+    with pytest.raises(InputError, match="path of a file, got dict"):
+        use({"name": "x"})
+
+
+@pytest.mark.parametrize("fast", [False, True])
+def test_a_recording_is_an_mcap_file(tmp_path, fast):
+    with pytest.raises(InputError, match=r"\.mcap"):
+        api.run(SINE, tmp_path / "out.csv", fast=fast)
+    assert not [*tmp_path.iterdir()]
+
+
 def test_an_experiment_is_loaded_and_checked():
     assert api.load(SINE, ["waveform.amplitude=2.5"]).config.waveform.amplitude == 2.5
     assert api.check(SINE, SHORT).forecast.samples == 1000

@@ -18,7 +18,14 @@ TABLE = SampleTable(
 
 def test_a_table_is_a_mapping_of_columns():
     assert (len(TABLE), TABLE.rows) == (3, 3)
-    assert repr(TABLE) == "<3 samples: t_s [s], displacement_um [um], flags>"
+    columns = "t_s [s], displacement_um [um], flags"
+    assert repr(TABLE) == f"<mapping of 3 columns, 3 samples each: {columns}>"
+    assert TABLE.columns == [*TABLE] == ["t_s", "displacement_um", "flags"]
+    with pytest.raises(KeyError, match="did you mean 'displacement_um'"):
+        TABLE["displacement"]
+    assert "displacement" not in TABLE
+    with pytest.raises(TypeError, match=r"table\['t_s'\]\[:5\]"):
+        TABLE[:5]
     assert SampleTable({}, {}).rows == 0
 
 

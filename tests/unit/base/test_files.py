@@ -87,7 +87,7 @@ class TestWriting:
         link = tmp_path / "link"
         link.symlink_to(path.name)
         for name in (path, link):
-            with pytest.raises(InputError, match="--overw"):
+            with pytest.raises(InputError, match="or overwrite"):
                 write_text(name, "new", overwrite=False)
             with pytest.raises(InputError, match="exists already"):
                 check_writable(name, overwrite=False)

@@ -283,40 +283,40 @@ def test_problems_of_a_setting_point_to_it():
         one.set(assignment)
     with pytest.raises(ConfigError) as caught:
         one.validate(SetUp)
-    part = "--set parts.0={kind: round, radius: 1.0}"
+    part = "setting parts.0={kind: round, radius: 1.0}"
     assert places(caught.value) == [
-        "--set limits.peak_a=1_0: limits.peak_a",
+        "setting limits.peak_a=1_0: limits.peak_a",
         f"{part}: parts.0.radius_um",
         f"{part}: parts.0.radius",
-        "--set colors.red=1: colors",
+        "setting colors.red=1: colors",
     ]
 
 
 def test_a_setting_forgets_the_places_it_replaces():
     one = document()
     one.set("parts=[{kind: round, radius_um: 1.0}]")
-    assert one.where(("parts", 0, "radius_um")).startswith("--set parts=")
-    assert one.where(("parts", 1, "side_um")).startswith("--set parts=")
+    assert one.where(("parts", 0, "radius_um")).startswith("setting parts=")
+    assert one.where(("parts", 1, "side_um")).startswith("setting parts=")
     assert one.where(("limits", "peak_a")) == "bench.yaml:3"
 
 
 @pytest.mark.parametrize(("assignment", "message"), [
-    ("name", "--set name: must be dotted.key=value"),
-    ("=5", "--set =5: must be dotted.key=value"),
-    ("limits..peak_a=5", "--set limits..peak_a=5: must be dotted.key=value"),
-    (".".join("a" * 40) + "=1", "--set a.a"),
-    ("name.first=5", "--set name.first=5: name.first: there is no such key to set"),
-    ("limits.peak_a.x=5", "--set limits.peak_a.x=5: limits.peak_a.x: there is no such key to set"),
-    ("limits.steps.3=5", "--set limits.steps.3=5: limits.steps.3: there is no such key to set"),
-    ("limits.steps.-1=5", "--set limits.steps.-1=5: limits.steps.-1: there is no such key"),
-    ("limits.steps.²=5", "--set limits.steps.²=5: limits.steps.²: there is no such key"),
-    ("parts.one.side_um=5", "--set parts.one.side_um=5: parts.one: there is no such key to set"),
-    ("name=[1", "--set name=[1: name: is not readable YAML, got '[1' ("),
-    ("name=*x", "--set name=*x: name: is not readable YAML, got '*x' (aliases"),
-    ("name=!!int 5", "--set name=!!int 5: name: is not readable YAML, got '!!int 5' (tags"),
-    ('name="\\U99999999"', '--set name="\\U99999999": name: is not readable YAML'),
+    ("name", "setting name: must be dotted.key=value"),
+    ("=5", "setting =5: must be dotted.key=value"),
+    ("limits..peak_a=5", "setting limits..peak_a=5: must be dotted.key=value"),
+    (".".join("a" * 40) + "=1", "setting a.a"),
+    ("name.first=5", "setting name.first=5: name.first: there is no such key to set"),
+    ("limits.peak_a.x=5", "setting limits.peak_a.x=5: limits.peak_a.x: there is no such key"),
+    ("limits.steps.3=5", "setting limits.steps.3=5: limits.steps.3: there is no such key to set"),
+    ("limits.steps.-1=5", "setting limits.steps.-1=5: limits.steps.-1: there is no such key"),
+    ("limits.steps.²=5", "setting limits.steps.²=5: limits.steps.²: there is no such key"),
+    ("parts.one.side_um=5", "setting parts.one.side_um=5: parts.one: there is no such key to set"),
+    ("name=[1", "setting name=[1: name: is not readable YAML, got '[1' ("),
+    ("name=*x", "setting name=*x: name: is not readable YAML, got '*x' (aliases"),
+    ("name=!!int 5", "setting name=!!int 5: name: is not readable YAML, got '!!int 5' (tags"),
+    ('name="\\U99999999"', 'setting name="\\U99999999": name: is not readable YAML'),
     ("limits={peak_a: 1, peak_a: 2}",
-     "--set limits={peak_a: 1, peak_a: 2}: limits.peak_a: stands twice"),
+     "setting limits={peak_a: 1, peak_a: 2}: limits.peak_a: stands twice"),
 ])  # fmt: skip
 def test_settings_that_cannot_be_made(assignment, message):
     assert refusal(document().set, assignment).startswith(message)

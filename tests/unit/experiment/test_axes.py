@@ -90,17 +90,17 @@ def test_settings_are_those_of_all_axes_or_of_one(stage):
     x, y = load_axes(stage(), ["waveform.amplitude=2", "axes.y.device.seed=5"])
     assert x.config.waveform.amplitude == 2.0
     assert [each.config.device["seed"] for each in (x, y)] == [1, 5]
-    assert y.document.where(("device", "seed")) == "--set axes.y.device.seed=5, y"
+    assert y.document.where(("device", "seed")) == "setting axes.y.device.seed=5, y"
 
 
 @pytest.mark.parametrize(("settings", "where", "key"), [
-    (["axes.x.sample_rate_hz=5"], "--set axes.x.sample_rate_hz=5, x", "axes.x.sample_rate_hz"),
-    (["axes.X.zero=true"], "--set axes.X.zero=true", "axes.X"),
-    (["axes.y=none"], "--set axes.y=none", "axes.y"),
-    (["axes={}"], "--set axes={}", "axes"),
-    (["axes.x.device.sed=1"], "--set axes.x.device.sed=1, x", "device.sed"),
-    (["axis=z"], "--set axis=z", "axis"),
-    (["device.seed=3"], "--set device.seed=3", "device.seed"),  # each axis has its own
+    (["axes.x.sample_rate_hz=5"], "setting axes.x.sample_rate_hz=5, x", "axes.x.sample_rate_hz"),
+    (["axes.X.zero=true"], "setting axes.X.zero=true", "axes.X"),
+    (["axes.y=none"], "setting axes.y=none", "axes.y"),
+    (["axes={}"], "setting axes={}", "axes"),
+    (["axes.x.device.sed=1"], "setting axes.x.device.sed=1, x", "device.sed"),
+    (["axis=z"], "setting axis=z", "axis"),
+    (["device.seed=3"], "setting device.seed=3", "device.seed"),  # each axis has its own
 ])  # fmt: skip
 def test_wrong_settings(stage, settings, where, key):
     (problem,) = refused(stage(), *settings)

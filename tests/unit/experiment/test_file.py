@@ -275,7 +275,7 @@ class TestSet:
         ("limits.stroke_um.2=5", "limits.stroke_um.2"),
     ])  # fmt: skip
     def test_broken(self, folder, setting, key):
-        assert problems(FULL, folder, (setting,)) == [(f"--set {setting}", key)]
+        assert problems(FULL, folder, (setting,)) == [(f"setting {setting}", key)]
 
     def test_a_broken_file_can_be_mended(self, folder):
         text = changed("frequency_hz: 10.0", "frequency_hz: 1:30")

@@ -101,7 +101,7 @@ def refusals(text, *settings, **given):
     for problem in caught.value.problems:
         name, _, line = problem.where.partition(":")
         key = problem.key.rpartition(".")[2]
-        assert name.startswith("--set") or key in lines[int(line) - 1], problem
+        assert name.startswith("setting ") or key in lines[int(line) - 1], problem
     return caught.value.problems
 
 

@@ -167,9 +167,9 @@ def _refuse(campaign: CampaignSteps, failed: Sequence[tuple[CampaignStep, Config
 
 def _where(campaign: CampaignSteps, step: CampaignStep, problem: ConfigProblem) -> str:
     """Return the location of a value; values of a step are in the campaign file."""
-    if not problem.where.startswith("--set "):
+    if not problem.where.startswith("setting "):
         return problem.where
-    key, document = key_of(problem.where.removeprefix("--set ")), campaign.document
+    key, document = key_of(problem.where.removeprefix("setting ")), campaign.document
     places = [*locs_of(campaign.config, key), ("set", key), (key,)]
     if step.is_reference:
         places.insert(-1, ("reference_run", "set", key))

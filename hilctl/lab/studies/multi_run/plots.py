@@ -161,7 +161,7 @@ def write_sheets(
     names = [folder / f"{sheet.name}.{each}" for sheet in sheets for each in formats]
     taken = [path for path in names if exists(path)]
     if taken and not overwrite:
-        raise already_there(taken[0], "choose another --output, or --overwrite")
+        raise already_there(taken[0], "choose another output, or overwrite")
     make_folder(folder)
     written: dict[Path, str] = {}
     for sheet, (name, figure) in zip(sheets, draw_sheets(sheets, width, on_done), strict=True):

@@ -82,7 +82,7 @@ class TestConsistency:
             loaded(CURRENT, f"limits.{setting}")
         [problem] = caught.value.problems
         key = f"limits.{setting.split('=')[0]}"
-        assert (problem.where, problem.key) == (f"--set limits.{setting}", key)
+        assert (problem.where, problem.key) == (f"setting limits.{setting}", key)
 
     @pytest.mark.parametrize(("text", "settings", "word"), [
         (CURRENT, ["tracking_error_um=2.0"], "compensator"),

@@ -85,7 +85,7 @@ def test_settings_are_checked_together():
         settings_from("ppi", texts)
     problems = {problem.key: str(problem) for problem in caught.value.problems}
     assert problems.keys() == {"plays", "weigths", "lines", "lag", "table.rate_hz", "starts"}
-    assert problems["plays"] == "--set plays=0: plays: must be >= 1, got 0"
+    assert problems["plays"] == "setting plays=0: plays: must be >= 1, got 0"
     assert "'weights'" in problems["weigths"]
     assert "preisach" in problems["lines"]
     assert "--model staged" in problems["lag"]
