@@ -1,10 +1,11 @@
 """An emulated device of text or fixed frames: a profile's templates in front of the rig."""
 
 import re
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 
 from hilctl_drivers.ascii.ascii_profile import (
     AsciiInput,
+    AsciiOutput,
     AsciiProfile,
     AsciiStep,
     AskStep,
@@ -14,6 +15,7 @@ from hilctl_drivers.ascii.ascii_profile import (
     NumberStep,
     Reply,
     SendStep,
+    fill,
     pattern_of,
 )
 from hilctl_drivers.ascii.message_format import LineFormat, formats
@@ -91,8 +93,8 @@ class EmulatedText(SerialDevice):
         if watchdog != "none" and watchdog.kick == "any":
             self._timer.fed_ns = self._now_ns
         parts = (
-            self._outputs, self._queries, self._digital, self._watchdog, self._questions,
-            self._steps,
+            self._outputs, self._queries, self._joint, self._digital, self._watchdog,
+            self._questions, self._steps,
         )  # fmt: skip
         for part in parts:
             found = part(text)
@@ -120,6 +122,8 @@ class EmulatedText(SerialDevice):
         text, combined = message.decode("ascii", "replace"), self.profile.exchange
         writes = {name: output.write for name, output in self.profile.outputs.items()}
         found = {name for name, template in writes.items() if self._matches(template, text)}
+        if (joint := self.profile.joint) != "none":
+            found |= {name for name, _ in self._arguments(joint.write, self.profile.outputs, text)}
         if combined != "none" and self._matches(combined.write, text):
             found.add(combined.output)
         return found
@@ -193,6 +197,40 @@ class EmulatedText(SerialDevice):
                 said = self._values if readback.of == "output" else self._commands
                 reply = _with_number(readback, reply, output.number(said[name]))
         return reply or None
+
+    def _joint(self, text: str) -> str | None:
+        """Execute a line that reads or sets several channels."""
+        if (joint := self.profile.joint) == "none":
+            return None
+        inputs = self._arguments(joint.ask, self.profile.inputs, text)
+        if inputs:
+            sources = ((name, self.profile.inputs[name]) for name, _ in inputs)
+            return " \n".join(self._said(name, source, source) for name, source in sources)
+        outputs = self._arguments(joint.write, self.profile.outputs, text)
+        for name, fields in outputs:
+            self._set(name, fields["value"], "")
+        return "" if outputs else None
+
+    def _arguments(
+        self, command: str, channels: Mapping[str, AsciiInput | AsciiOutput], text: str
+    ) -> list[tuple[str, dict[str, float]]]:
+        """Return the channels in a line of a command, with their fields; none in another line."""
+        start = fill(command, address=self._address) + " "
+        words = text.removeprefix(start).split(" ") if text.startswith(start) else []
+        arguments = [(name, each.argument) for name, each in channels.items() if each.argument]
+        found: list[tuple[str, dict[str, float]]] = []
+        while words:
+            for name, argument in arguments:
+                size = argument.count(" ") + 1
+                matcher = TemplateMatcher(argument, self._address)
+                fields = matcher.match(" ".join(words[:size]))
+                if fields is not None:
+                    found.append((name, fields))
+                    words = words[size:]
+                    break
+            else:
+                return []
+        return found
 
     def _said(self, name: str, source: AsciiInput, form: MeasuredReply, reply: str = "") -> str:
         """Return the reply of a form with a reading, or the reply that marks it as invalid."""

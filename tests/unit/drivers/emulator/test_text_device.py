@@ -6,6 +6,7 @@ import pytest
 
 from hilctl_drivers.emulator.text_device import in_style
 from hilctl_drivers.emulator.wire import TemplateMatcher
+from hilctl_drivers.simulated.devices import PiezoOptions
 
 DCON = (Path(__file__).parents[3] / "data" / "dcon_module.yaml").read_text()
 
@@ -117,14 +118,31 @@ def test_gen_refuses_with_its_codes(emulate):
     ("tdk_lambda_gen", b"PC 5.000", {"current"}),
     ("tdk_lambda_gen", b"PC?", set()),
     ("pi_e727", b"SVA 1 2.5000", {"axis1"}),
+    ("pi_e727_3cd", b"SVA 3 1.5000 1 2.5000", {"axis1", "axis3"}),
+    ("pi_e727_3cd", b"POS? 3 1", set()),
+    ("pi_e727_3cd", b"SVA 3 1.5000 4 2.5000", set()),
     ("kepco_bop", b"CURR 3.000000;:MEAS:CURR?", {"current"}),
     ("cobs_board", b"\x10\x01\x01\0\0\0\0\0", {"DAC"}),
     ("cobs_board", b"\x14\x01", set()),
 ])  # fmt: skip
 def test_outputs_that_a_message_writes(emulate, profile, message, written):
-    reader = None if profile in {"pi_e727", "cobs_board"} else "agilent_34970a"
+    reader = None if profile.startswith(("pi_", "cobs_")) else "agilent_34970a"
     made = emulate(profile, reader=reader)
     assert made.emulator.wires[0].written(message) - {""} == written
+
+
+def test_a_line_reads_or_sets_several_channels(emulate):
+    made = emulate("pi_e727_3cd", actuator=PiezoOptions(noise=False))
+    assert made.ask(b"SVA 2 20.0000 1 10.0000") is None
+    assert [(each["output"], each["value"]) for each in made.writes()] == [
+        ("axis2", 20.0), ("axis1", 10.0),
+    ]  # fmt: skip
+    first, second = made.ask(b"POS? 2 1", after_ms=10).split(b" \n")
+    assert (first[:2], second[:2]) == (b"2=", b"1=")
+    assert second == made.ask(b"POS? 1")
+    assert made.ask(b"SVA? 2") == b"2=20.0000"
+    assert made.ask(b"SVA 2 20.0000 1") is None
+    assert len(made.writes()) == 2
 
 
 class TestFrames:
