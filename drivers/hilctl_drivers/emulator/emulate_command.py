@@ -12,9 +12,9 @@ from typing import Annotated, Any, cast
 
 import typer
 
-from hilctl.base.axes import axis_documents, names_text, problems_of_axes, with_settings
+from hilctl.base.axes import axis_documents, names_text, of_each_axis, with_settings
 from hilctl.base.device import limited_range
-from hilctl.base.errors import ConfigError, ConfigProblem, InputError
+from hilctl.base.errors import ConfigError, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import finite_json
 from hilctl.base.types import CommandUnit
@@ -94,26 +94,22 @@ def wired_experiment(
 ) -> WiredExperiment:
     """Return the devices of an experiment to emulate; raise InputError if one has no profile."""
     # Port 0 stands for that of the experiment, or for a free one if users may not listen there.
-    parts = axis_documents(with_settings(load_document(path), settings))
-    simulated = _by_axis(_actuator_document(actuator), [*parts])
-    files, devices, axes = TextFiles(), dict[Any, EmulatorOptions](), list[WiredAxis]()
-    problems: dict[str, Sequence[ConfigProblem]] = {}
-    for number, (name, document) in enumerate(parts.items()):
-        problems[name] = ()
-        try:
-            options = _device_options(document, path.parent, files)
-            rig = _rig_options(name, document, options, simulated[name], number)
-        except ConfigError as error:
-            problems[name] = error.problems
-            continue
+    document, files = with_settings(load_document(path), settings), TextFiles()
+    names = [*axis_documents(document)]
+    simulated = _by_axis(_actuator_document(actuator), names)
+
+    def wired(name: str, part: Document) -> tuple[DacOptions, RigOptions, Mapping[str, Any]]:
+        options = _device_options(part, path.parent, files)
+        rig = _rig_options(name, part, options, simulated[name], names.index(name))
+        return options, rig, part.data["device"]
+
+    devices, axes = dict[Any, EmulatorOptions](), list[WiredAxis]()
+    for name, (options, rig, section) in of_each_axis(document, wired).items():
         place = _place(options)
         made = devices.get(place) or _emulator_options(options, path.parent, host, port)
         devices[place] = replace(made, rigs=(*made.rigs, rig))
-        index = [*devices].index(place)
-        axes.append(WiredAxis(name, document.data["device"], index, len(made.rigs)))
+        axes.append(WiredAxis(name, section, [*devices].index(place), len(made.rigs)))
         port = 0  # of the first device
-    if any(problems.values()):
-        raise ConfigError(problems_of_axes(problems))
     return WiredExperiment(path, tuple(settings), tuple(axes), tuple(_apart(devices.values())))
 
 
