@@ -9,7 +9,7 @@ from hilctl.base.device import AuxChannel
 from hilctl.base.errors import InputError
 from hilctl_drivers.endpoint import Endpoint, reader_of
 from hilctl_drivers.profile_base import BaseProfile, Range
-from hilctl_drivers.session import SensorReader, SteppedSession, request_ahead, session_class
+from hilctl_drivers.session import SensorReader, SteppedSession, session_class
 from hilctl_drivers.signal_chain import (
     AuxInput,
     DacOptions,
@@ -161,16 +161,12 @@ class DacSetup:
         both = read.then(wire)
         if self.shares_link:
             return both
-        if request_ahead(self.reader, self.input):
+        if session_class(self.reader).request(self.reader, self.input):
             shorter, longer = sorted((read, wire), key=lambda each: each.total_s)
             return longer.named(f"with {shorter.what} at the same time")
-        # Of two links, one is silent before its next request while the other is at work.
-        silent_s = (
-            min(self.reader.profile.link.silence_s, wire.total_s),
-            min(self.writer.profile.link.silence_s, read.total_s),
-        )
-        gaps = both.gaps - sum(each > 0.0 for each in silent_s)
-        return replace(both, gaps=gaps, gaps_s=both.gaps_s - sum(silent_s))
+        # The link of the output is silent before its next request while the other is at work.
+        silent_s = min(self.writer.profile.link.silence_s, read.total_s)
+        return replace(both, gaps=both.gaps - (silent_s > 0.0), gaps_s=both.gaps_s - silent_s)
 
     def rates(self, wire: WireTime, lowest_hz: float = 0.0, settle_s: float = 0.0) -> RateLimit:
         """Return the sample rates that a sample's time and the devices allow.

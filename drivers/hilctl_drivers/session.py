@@ -134,11 +134,6 @@ def session_class(device: Endpoint) -> type[Session]:
     return cast("type[Session]", resolve_name(device.profile.SESSION))
 
 
-def request_ahead(device: Endpoint, source: Range) -> bytes:
-    """Return the request of a reading that can be sent before another exchange; empty if none."""
-    return b"" if device.framing == "tcp" else session_class(device).request(device, source)
-
-
 class SensorReader:
     """Reader of an input.
 
@@ -161,7 +156,7 @@ class SensorReader:
         self.link: Link = self._own or link
         self.session: Session = session_class(device).on(device, self.link)
         self._read = self.session.input_reader(source)
-        self._request = request_ahead(device, source) if own else b""
+        self._request = self.session.request(device, source) if own else b""
 
     def open(self) -> None:
         """Connect and identify the device."""

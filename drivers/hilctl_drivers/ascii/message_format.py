@@ -5,12 +5,11 @@ Manual" 7.5.
 """
 
 import re
-from abc import ABC, abstractmethod
 from collections.abc import Iterator
 from dataclasses import dataclass
 from functools import reduce
 from operator import xor
-from typing import ClassVar, Literal
+from typing import ClassVar, Literal, TypeAlias
 
 from hilctl_drivers.ascii.ascii_profile import AnyLink, ByteFrames
 from hilctl_drivers.ascii.number_format import as_text
@@ -19,7 +18,6 @@ from hilctl_drivers.transport.framing import split_at
 from hilctl_drivers.transport.links import (
     BadRequestError,
     CorruptError,
-    IncompleteError,
     Missing,
 )
 
@@ -36,34 +34,8 @@ def _is_text(text: str) -> bool:
     return text.isascii() and text.isprintable()
 
 
-class MessageFormat(ABC):
-    """Format of one message, which has a text; a text of several lines is several messages."""
-
-    NAME: ClassVar[str]
-
-    @abstractmethod
-    def encode(self, text: str) -> bytes:
-        """Return a message; raise BadRequestError if it cannot be sent."""
-
-    @abstractmethod
-    def missing(self, text: str, example: str) -> Missing:
-        """Return the number of bytes missing from the reply to ``text``, like ``example``."""
-
-    @abstractmethod
-    def split(self, data: Bytes, text: str, example: str) -> list[str]:
-        """Return the texts of the messages of a reply to ``text``, like ``example``."""
-
-    def wire(self, text: str) -> bytes:
-        """Return a text of one or more messages as it is sent."""
-        return b"".join(map(self.encode, text.split("\n")))
-
-    def size(self, text: str) -> int:
-        """Return the bytes of a text of one or more messages."""
-        return len(self.wire(text))
-
-
 @dataclass(frozen=True)
-class LineFormat(MessageFormat):
+class LineFormat:
     """Format of one line: ``text | checksum | terminator``.
 
     The text of a whole reply may have several lines; it has none of the CR and LF at its ends.
@@ -93,34 +65,29 @@ class LineFormat(MessageFormat):
         return body + self.terminator
 
     def decode(self, line: Bytes) -> str:
-        """Return the text of exactly one line.
-
-        Raises:
-            IncompleteError: The terminator has not arrived yet.
-            CorruptError: Wrong checksum, too long, not printable ASCII, or bytes after the end.
-        """
-        data = bytes(line)
-        end = data.find(self.terminator)
-        if end < 0 and len(data) < self.size_max + len(self.terminator):
-            raise IncompleteError(f"{data!r} without {self.terminator!r}")
-        if end != len(data) - len(self.terminator):
+        """Return the text of exactly one line; raise CorruptError for anything else."""
+        text, end, rest = bytes(line).partition(self.terminator)
+        if rest or not end:
             rule = f"must be one line that ends in {self.terminator!r} (reply_terminator)"
-            raise CorruptError(f"{rule}, got {data!r}")
-        return self._text(data[:end])
+            raise CorruptError(f"{rule}, got {bytes(line)!r}")
+        return self._text(text)
 
     def messages(self, received: bytearray) -> Iterator[str]:
         """Remove the complete lines from a stream; yield the texts of the good ones."""
         return split_at(received, self.terminator, self._text)
 
     def wire(self, text: str) -> bytes:
-        """See :meth:`MessageFormat.wire`."""
-        if not self.is_whole:
-            return super().wire(text)
+        """Return a text of one or more lines as it is sent."""
         *lines, last = text.split("\n")
-        return b"".join(line.encode() + b"\r\n" for line in lines) + self.encode(last)
+        ends = (f"{each}\r\n".encode() if self.is_whole else self.encode(each) for each in lines)
+        return b"".join(ends) + self.encode(last)
+
+    def size(self, text: str) -> int:
+        """Return the bytes of a text of one or more lines."""
+        return len(self.wire(text))
 
     def missing(self, text: str, example: str) -> Missing:
-        """See :meth:`MessageFormat.missing`."""
+        """Return the number of bytes missing from the reply to ``text``, like ``example``."""
         lines = self._count(text, example)
 
         def missing(got: bytearray) -> int:
@@ -131,7 +98,7 @@ class LineFormat(MessageFormat):
         return missing
 
     def split(self, data: Bytes, text: str, example: str) -> list[str]:
-        """See :meth:`MessageFormat.split`; there may be more lines than in ``example``."""
+        """Return the texts of a reply to ``text`` with as many lines as ``example``, or more."""
         *others, last = bytes(data).split(self.terminator, self._count(text, example) - 1)
         return [self.decode(line) for line in (*(each + self.terminator for each in others), last)]
 
@@ -157,7 +124,7 @@ class LineFormat(MessageFormat):
 
 
 @dataclass(frozen=True)
-class FrameFormat(MessageFormat):
+class FrameFormat:
     """Format of one frame, whose text is its bytes in hexadecimal: ``bytes | checksum | bytes``."""
 
     check: Crc = CRCS["none"]
@@ -183,16 +150,25 @@ class FrameFormat(MessageFormat):
         end = max(0, len(frame) - self.behind - self.check.size)
         return as_text(bytes(frame[:end]) + bytes(frame[end + self.check.size :]))
 
+    def wire(self, text: str) -> bytes:
+        """Return a text of one or more frames as it is sent."""
+        return b"".join(map(self.encode, text.split("\n")))
+
+    def size(self, text: str) -> int:
+        """Return the bytes of a text of one or more frames."""
+        return len(self.wire(text))
+
     def missing(self, text: str, example: str) -> Missing:
-        """See :meth:`MessageFormat.missing`."""
+        """Return the number of bytes missing from a frame as long as ``example``."""
         size = self.size(example)
         return lambda got: max(0, size - len(got))
 
     def split(self, data: Bytes, text: str, example: str) -> list[str]:
-        """See :meth:`MessageFormat.split`; there is one."""
+        """Return the text of a reply."""
         return [self.decode(data)]
 
 
+MessageFormat: TypeAlias = LineFormat | FrameFormat
 _FRAME_CHECKS = {
     **CRCS,
     "sum8": Crc("sum8", 8, lambda data: sum(data) & 0xFF),

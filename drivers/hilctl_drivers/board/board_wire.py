@@ -131,18 +131,16 @@ class BoardWire(Wire):
         if self.fifo_depth:
             readings = self._queue(first_sample, values)
         else:
-            exchange = partial(self._exchange_one, values)
+            exchange = partial(self.session.exchange, values)
             reader = self._reader
-            readings = exchange() if reader is None else np.array([reader.read_while(exchange)])
+            if reader is None:
+                readings = exchange().values
+            else:
+                readings = np.array([reader.read_while(exchange)])
+            if readings.size != 1:
+                raise DeviceError(f"{readings.size} readings received for one sample")
         if readings.size:
             self.setup.chain.fill_um(readings, displacement_um)
-
-    def _exchange_one(self, values: F64) -> F64:
-        """Exchange a sample, and return the reading of the board."""
-        readings = self.session.exchange(values).values
-        if readings.size != 1:
-            raise DeviceError(f"{readings.size} readings received for one sample")
-        return readings
 
     def _queue(self, first_sample: int, values: F64) -> F64:
         """Queue a block and wait for the readings of the block that leaves the FIFO."""

@@ -32,7 +32,7 @@ from hilctl_drivers.emulator.wire import EmulatedLine, EmulatedWire, SerialProfi
 from hilctl_drivers.modbus.modbus_profile import ModbusProfile
 from hilctl_drivers.profile import load_profile
 from hilctl_drivers.profile_base import BaseProfile, Range, SerialLineSettings
-from hilctl_drivers.sensor_stream.stream_profile import SensorStreamUdpLink, StreamProfile
+from hilctl_drivers.sensor_stream.stream_profile import StreamProfile
 from hilctl_drivers.simulated.devices import (
     PiezoOptions,
     PiezoStage,
@@ -298,7 +298,7 @@ class _Served:
 
     def open(self, server: EmulatorServer, wire: EmulatedWire, host: str) -> str:
         """Serve a wire, and return its address."""
-        if isinstance(self.profile.link, SensorStreamUdpLink):
+        if self.profile.link.kind == "sensor_stream_udp":
             return server.send_udp(wire, host, self.port)
         if self.tcp:
             return server.listen_tcp(wire, host, self.port)

@@ -5,10 +5,10 @@ from abc import abstractmethod
 from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, replace
 from string import Formatter
-from typing import TypeAlias, cast
+from typing import TypeAlias
 
 from hilctl_drivers.ascii.ascii_profile import SAMPLES, AsciiProfile, fill
-from hilctl_drivers.ascii.message_format import FrameFormat, LineFormat, formats
+from hilctl_drivers.ascii.message_format import FrameFormat, formats
 from hilctl_drivers.ascii.number_format import number_format
 from hilctl_drivers.board.board_profile import FrameProfile, FramesLink
 from hilctl_drivers.emulator.rig import EmulatedDevice
@@ -163,7 +163,7 @@ class EmulatedLine(EmulatedWire):
                 size_of, decode = _frame_size(requests, profile), requests.decode
                 self._messages = lambda received: split_sized(received, size_of, decode)
             else:
-                self._messages = cast(LineFormat, requests).messages
+                self._messages = requests.messages
             self._encode = lambda message: replies.wire(message.decode())
             self._echoes = link.echo
 

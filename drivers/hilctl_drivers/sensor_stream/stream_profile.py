@@ -26,25 +26,18 @@ class AgingSettings(LinkSettings):
 
 
 class SensorStreamLink(AgingSettings):
-    """A TCP connection to the sensor."""
+    """A TCP connection to the sensor, or datagrams from it, each of whole blocks."""
 
-    kind: Literal["sensor_stream"]
-    port: int = Field(ge=1, le=65535, description="TCP port")
+    kind: Literal["sensor_stream", "sensor_stream_udp"]
+    port: int = Field(
+        ge=1, le=65535, description="TCP port; UDP port of this machine to which the sensor sends"
+    )
 
 
 class SensorStreamSerialLink(AgingSettings, BinaryLineSettings):
     """A serial line from the sensor."""
 
     kind: Literal["sensor_stream_serial"]
-
-
-class SensorStreamUdpLink(AgingSettings):
-    """Datagrams from the sensor, each of whole blocks."""
-
-    kind: Literal["sensor_stream_udp"]
-    port: int = Field(
-        ge=1, le=65535, description="UDP port of this machine to which the sensor sends"
-    )
 
 
 def _check_begin(text: str) -> str:
@@ -124,7 +117,7 @@ class StreamInput(RawChannel):
 
 
 AnyStreamLink: TypeAlias = Annotated[
-    SensorStreamLink | SensorStreamSerialLink | SensorStreamUdpLink, Field(discriminator="kind")
+    SensorStreamLink | SensorStreamSerialLink, Field(discriminator="kind")
 ]
 
 

@@ -10,7 +10,6 @@ from hilctl_drivers.profile_base import SerialLineSettings
 from hilctl_drivers.sensor_stream.bits import bits_of, bits_regex
 from hilctl_drivers.sensor_stream.stream_profile import (
     HeaderField,
-    SensorStreamUdpLink,
     StreamInput,
     StreamProfile,
 )
@@ -140,7 +139,7 @@ class SensorStreamSession(Session):
         line, timeout_s = device.profile.link, device.timeout_s
         if isinstance(line, SerialLineSettings) and not device.host:
             return SerialLink(str(device.port), line, timeout_s)
-        kind = UdpReceiver if isinstance(line, SensorStreamUdpLink) else TcpReceiver
+        kind = UdpReceiver if line.kind == "sensor_stream_udp" else TcpReceiver
         return kind(device.host, int(device.port), timeout_s)
 
     @staticmethod

@@ -54,6 +54,40 @@ def test_exchanges_over_tcp():
         assert link.transact(b"tell", lambda got: 0) == b""
 
 
+@pytest.mark.parametrize("usual", [0, len(REPLY)])
+def test_a_request_sent_ahead_is_sent_once(usual):
+    sent = []
+
+    def act(connection):
+        for _ in range(2):
+            sent.append(connection.recv(100))
+            connection.sendall(REPLY)
+        connection.recv(100)
+
+    with stream(act) as link:
+        link.begin(b"ask")
+        assert link.transact(b"ask", missing, usual) == REPLY
+        assert link.transact(b"ask", missing, usual) == REPLY
+    assert sent == [b"ask", b"ask"]
+
+
+def test_the_reply_to_another_request_than_the_one_sent_ahead_is_discarded():
+    replied = threading.Event()
+
+    def act(connection):
+        connection.recv(100)
+        connection.sendall(b"late reply")
+        replied.set()
+        assert connection.recv(100) == b"two"
+        connection.sendall(REPLY)
+        connection.recv(100)
+
+    with stream(act) as link:
+        link.begin(b"one")
+        replied.wait(PATIENT_S)
+        assert link.transact(b"two", missing) == REPLY
+
+
 def test_a_late_reply_is_discarded():
     received, late = threading.Event(), threading.Event()
 
