@@ -50,6 +50,8 @@ _RULES = {
     "less_than_equal": "must be <= {le}",
     "too_short": "must have at least {min_length} values",
     "too_long": "must have at most {max_length} values",
+    "string_too_short": "must have at least {min_length} characters",
+    "string_pattern_mismatch": "must match the pattern {pattern}",
     "value_error": "{error}",
 }
 WORDS = {"literal_error", "union_tag_invalid"}

@@ -74,14 +74,15 @@ def _check_template(text: str) -> str:
     try:
         parts = [*Formatter().parse(text)]
     except ValueError:
-        raise ValueError("must have { and } around fields only, doubled elsewhere") from None
+        rule = "must have { and } around fields only, doubled elsewhere"
+        raise ValueError(f"{rule}, got {text!r}") from None
     for _, field, form, conversion in parts:
         if field is not None and (field not in SAMPLES or conversion or "{" in (form or "")):
             known = ", ".join(f"{{{name}}}" for name in SAMPLES)
-            raise ValueError(f"fields must be of {known}")
+            raise ValueError(f"fields must be of {known}, got {text!r}")
     lines = fill(text, **SAMPLES).split("\n")
     if not all(line and line.isprintable() for line in lines) or not text.isascii():
-        raise ValueError(r"must be printable ASCII, with \n between lines")
+        raise ValueError(rf"must be printable ASCII, with \n between lines, got {text!r}")
     return text
 
 
@@ -89,7 +90,7 @@ def _check_pattern(text: str) -> str:
     try:
         pattern_of(text)
     except re.error as error:
-        raise ValueError(f"must be a regular expression: {error}") from None
+        raise ValueError(f"must be a regular expression, got {text!r}: {error}") from None
     return text
 
 
@@ -104,7 +105,8 @@ def fields_of(template: str) -> set[str]:
 
 def _check_terminator(text: str) -> str:
     if not 1 <= len(text) <= 8 or not text.isascii():
-        raise ValueError('must be 1 to 8 ASCII characters, such as "\\r\\n" or "> "')
+        rule = 'must be 1 to 8 ASCII characters, such as "\\r\\n" or "> "'
+        raise ValueError(f"{rule}, got {text!r}")
     return text
 
 

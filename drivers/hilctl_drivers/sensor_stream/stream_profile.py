@@ -43,14 +43,14 @@ class SensorStreamSerialLink(AgingSettings, BinaryLineSettings):
 def _check_begin(text: str) -> str:
     if not text or not text.isascii() or not text.isprintable():
         rule = "must be ASCII text such as MEAS, bytes such as AA 55, or bits"
-        raise ValueError(f"{rule} such as 00...... 01......")
+        raise ValueError(f"{rule} such as 00...... 01......, got {text!r}")
     return text
 
 
 def _check_type(text: str) -> str:
     if text not in get_args(RegisterType) and not is_bits(text):
         rule = f"must be one of {', '.join(get_args(RegisterType))}, or bits such as"
-        raise ValueError(f"{rule} 00...... 01......")
+        raise ValueError(f"{rule} 00...... 01......, got {text!r}")
     return text
 
 

@@ -431,7 +431,7 @@ class Several(StrictModel):
       "x:1: span.1: must be >= 0, got -1"]),
     ("wave: {kind: sine}", ["x:1: wave.height: is required"]),
     ("names: {A1: 1.0}",
-     ["x:1: names.A1: string should match pattern '^[a-z]+$', got 'A1'"]),
+     ["x:1: names.A1: must match the pattern ^[a-z]+$, got 'A1'"]),
 ])  # fmt: skip
 def test_problems_of_union_types(text: str, problems: list[str]) -> None:
     with pytest.raises(ConfigError) as caught:
