@@ -35,7 +35,7 @@ SETUPS = {
     ),
 }
 GAINS = {"scpi": {"gain_a_per_v": 10.0 / 12.0}}
-FAULT_AT = {"dcon": 81, "scpi": 31, "cobs": 60, "fifo": 80}
+FAULT_AT = {"dcon": 81, "scpi": 32, "cobs": 60, "fifo": 80}
 
 
 @pytest.fixture
