@@ -109,7 +109,10 @@ class LeafStage(Plant):
     ) -> None:
         """Build the stage at rest after a long time at 0 V."""
         self._substeps = math.ceil(1.0 / (sample_rate_hz * parameters.step_max_s) - 1e-9)
-        super().__init__(parameters.sensor_noise_um, seed, max(1, CHUNK // self._substeps))
+        range_um = parameters.sensor_range_um
+        sensor = range_um / parameters.adc_codes, range_um
+        chunk = max(1, CHUNK // self._substeps)
+        super().__init__(parameters.sensor_noise_um, seed, sensor, chunk)
         step_s = 1.0 / (sample_rate_hz * self._substeps)
         ensure_compiled(_follow, respond)
         self._threshold, self._weight = parameters.thresholds_v(), parameters.weights()
@@ -124,8 +127,6 @@ class LeafStage(Plant):
             parameters.rubbing_um,
         )
         self._bristle_um = parameters.bristle_um
-        range_um = parameters.sensor_range_um
-        self._sensor = (range_um / parameters.adc_codes, range_um)
         modes = [(2.0 * math.pi * hz, damping, share) for hz, damping, share in parameters.modes]
         self._motion = motion(modes, parameters.sensor_bandwidth_hz, step_s)
         self._mechanics = np.zeros(self._motion.shape[1])
@@ -139,11 +140,11 @@ class LeafStage(Plant):
         self._plays[:] = 0.0
         self._crept[:] = 0.0
 
-    def _advance(self, command: F64, noise_um: F64, displacement_um: F64, measured: F64) -> None:
+    def _advance(self, command: F64, noise_um: F64, signal_um: F64, measured: F64) -> None:
         free_um = np.empty(command.size * self._substeps)
         _follow(
             command, measured, free_um, self._state, self._plays, self._threshold, self._weight,
             self._crept, self._decay, self._constants, self._substeps,
         )  # fmt: skip
-        fixed = self._mechanics, self._motion, 0.0, self._sensor, self._substeps
-        respond(free_um, noise_um, displacement_um, *fixed)
+        fixed = self._mechanics, self._motion, 0.0, self._substeps
+        respond(free_um, signal_um, *fixed)
