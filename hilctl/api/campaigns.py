@@ -6,11 +6,12 @@ from datetime import UTC, datetime
 from pathlib import Path
 
 from hilctl.api._types import PathLike, experiment_path, path_or_none, runs_folder
+from hilctl.base.axes import axis_documents
 from hilctl.base.errors import InputError
 from hilctl.base.files import check_no_input, check_writable, is_folder, write_text
 from hilctl.base.table import Column
 from hilctl.base.yaml import Settings, texts_of
-from hilctl.experiment.load import inputs_of
+from hilctl.experiment.load import document_with, inputs_of
 from hilctl.experiment.sections.correction import write_correction
 from hilctl.experiment.sections.coupling import Coupling, write_coupling
 from hilctl.lab.studies.calibrate import (
@@ -318,9 +319,10 @@ def learn(
         InputError: An input is invalid, or a file cannot be written; nothing has moved.
     """
     chosen = runs_folder(output, folder)
-    inputs = inputs_of(experiment_path(experiment), texts_of(settings))
-    session = IlcSession(experiment_path(experiment), texts_of(settings), chosen)
-    files = recordings_of(session.axes, Path(output))
+    path, given = experiment_path(experiment), texts_of(settings)
+    inputs = inputs_of(path, given)
+    axes = axis_documents(document_with(path, given))
+    files = recordings_of([*axes], Path(output))
     for file in files.values():
         check_writable(file, overwrite=overwrite, inputs=inputs)
     runs = [*chosen.glob("run-*.*")] if is_folder(chosen) else []
@@ -328,9 +330,10 @@ def learn(
         check_no_input(path, inputs)
     if not overwrite and any(path.suffix == ".mcap" for path in runs):
         raise InputError(f"{chosen}: contains runs: choose another folder, or overwrite")
+    session = IlcSession(path, given, chosen)
     host = StudyHost.of(fast=fast)
     with prepared(chosen, host.sleep_s, host.on_note):
         learned = run_study(session.study(cycles, on_rows), chosen, host, resume=False)
-        for axis, file in files.items():
-            write_correction(file, learned.corrections[axis], overwrite=overwrite)
+        for axis, correction in learned.corrections.items():
+            write_correction(files[axis], correction, overwrite=overwrite)
     return learned

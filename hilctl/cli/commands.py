@@ -29,7 +29,7 @@ _HELP = {
         "hilctl.cli.run": {
             "run": "Run an experiment and record it (Ctrl-C ramps to the safe value first).",
             "check": "Check an experiment and show what it would do (nothing moves).",
-            "safe": "Set a device to its safe value (refused while a run uses it).",
+            "safe": "Set the device of each axis to its safe value (refused while a run uses one).",
         },
         "hilctl.cli.control": {
             "status": "List active runs and their progress.",

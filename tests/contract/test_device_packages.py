@@ -82,7 +82,7 @@ def test_a_schema_with_a_broken_device_names_it(ended):
     ("close", {"check": 0, "sweep": 3, "safe": 0, "devices": 3}),
 ])  # fmt: skip
 def test_a_method_that_fails_or_exits(ended, experiment, monkeypatch, at, how, codes):
-    monkeypatch.setattr("hilctl.run.safety.manual_safe.PATIENCE_S", 0.0)
+    monkeypatch.setattr("hilctl.loop.safe_output.PATIENCE_S", 0.0)
     for name, expected in codes.items():
         words = {"sweep": SWEEP, "devices": ()}.get(name, ())
         first = ("devices", "probe") if name == "devices" else (name,)

@@ -299,12 +299,6 @@ class IlcSession:
         self._rows: list[IlcRow] = []
         self._refusals: list[str] = []
 
-    @property
-    def axes(self) -> list[str]:
-        """Names of the learned axes; one empty name if there is only one axis."""
-        learned = {each.axis for each in self._learners}
-        return [name for name in self._checked.names if name in learned]
-
     def study(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> Study[IlcResult]:
         """Run and learn until the error no longer improves.
 

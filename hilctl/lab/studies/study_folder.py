@@ -135,7 +135,7 @@ def completed_runs(folder: Path) -> dict[tuple[RunKey, ...], list[tuple[Path, ..
             continue
         run = read_ends(path).run
         names = axis_names(run) or [""]
-        there = axes.setdefault(run["run_id"] if run.get(AXIS_FACT) else str(path), {})
+        there = axes.setdefault(run.get("run_id", "") if run.get(AXIS_FACT) else str(path), {})
         there[run.get(AXIS_FACT, "")] = key, path
         if all(name in there for name in names):
             keys, paths = zip(*(there.pop(name) for name in names), strict=True)

@@ -145,8 +145,6 @@ def learn(monkeypatch, tmp_path, hilctl):
 
     def run(*words, **how):
         class Done:
-            axes = ("",)
-
             def __init__(self, experiment, settings, folder):
                 pass
 

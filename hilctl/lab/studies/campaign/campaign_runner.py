@@ -11,6 +11,7 @@ import signal
 import tempfile
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, field, replace
+from operator import methodcaller
 from pathlib import Path
 
 from hilctl.analysis.contour import contour
@@ -293,7 +294,7 @@ class WorkerRuns:
             raise result
         paths = recordings_of([*result.axes] or [""], output)
         for target, content in zip(paths.values(), contents, strict=True):
-            write_file(target, lambda stream: stream.write(content), overwrite=False)  # noqa: B023
+            write_file(target, methodcaller("write", content), overwrite=False)
         result = result.moved(paths)
         if row is not None:
             others = tuple(replace(each, recording=paths[each.axis].name) for each in row.others)

@@ -68,7 +68,7 @@ def columns_of(
     }
     for key in keys:
         columns[key] = _one_type([cell(step.point.get(key)) for step, _ in rows])
-    axes = {row.axis for _, row in rows} != {""}
+    axes = any(row.axis for _, row in rows)
     if axes:
         columns["axis"] = [row.axis for _, row in rows]
     for name in FIGURES:

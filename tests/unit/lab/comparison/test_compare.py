@@ -89,7 +89,7 @@ def test_saved_models_are_model_files(comparison, tmp_path):
         assert saved.provenance.source == (GOLDEN.name,)
         assert saved.provenance.created == "2026-01-01"
         assert saved.provenance.errors_percent["peak"] == row.error.peak_percent
-    with pytest.raises(InputError, match="--overwrite"):
+    with pytest.raises(InputError, match="overwrite"):
         save_models(comparison, tmp_path / "models", created="2026-01-01", overwrite=False)
 
 

@@ -30,6 +30,6 @@ def test_each_model_has_one_colour_in_all_figures(comparison):
 def test_an_existing_page_is_kept(tmp_path):
     page = tmp_path / "models.html"
     page.write_text("mine")
-    with pytest.raises(InputError, match="--overwrite"):
+    with pytest.raises(InputError, match="overwrite"):
         command([Path("nowhere.mcap")], html=page)
     assert page.read_text() == "mine"
