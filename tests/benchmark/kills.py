@@ -345,7 +345,7 @@ def main() -> int:
     parser.add_argument("--stall-s", type=float, default=0.0, help="time that a write takes")
     parser.add_argument("--within-ms", type=float, default=200.0, help="to safe beyond the ramp")
     parser.add_argument("--max-step", type=float, default=1.0, help="over the safe ramp's")
-    parser.add_argument("--json", action="store_true", help="print every attack as JSON")
+    parser.add_argument("--json", action="store_true", help="print a line for each attack")
     options = parser.parse_args()
     chance = random.Random(options.seed)
     kinds = [
@@ -367,11 +367,11 @@ def main() -> int:
             with attacked_run(place, *wires, stroke_um=stroke_um, environment=disk) as run:
                 attacked = judged(run, phase, attack(run, phase, targets, actions, chance))
             found.append((f"{phase}: {targets}", attacked))
+            if options.json:
+                print(json.dumps(asdict(attacked)), flush=True)
             if not attacked.is_good(1e-3 * options.within_ms, options.max_step):
                 print(attacked, file=sys.stderr, flush=True)
-    if options.json:
-        print(json.dumps([asdict(each) for _, each in found], indent=2))
-    else:
+    if not options.json:
         print_table(found)
     good = (each.is_good(1e-3 * options.within_ms, options.max_step) for _, each in found)
     return 0 if all(good) else 1

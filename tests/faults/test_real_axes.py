@@ -30,6 +30,7 @@ TIMEOUT_S = 1.5
 RAMP_S = 1.0
 RAMP_A_PER_S = 5.0 / RAMP_S
 SAFE_A = 1e-3
+LEVEL_A = 4.0
 
 
 class Stage:
@@ -126,16 +127,16 @@ def stage(tmp_path, profile):
 
 
 def began_s(times_ns, values_a):
-    """Return when a ramp to 0 at the usual slew began at ``values_a[0]``, in s.
+    """Return when a ramp from the held level to 0 at the usual slew began, in s.
 
     Writes may be delayed, so the earliest time counts.
     """
     on_ramp = np.abs(values_a) > SAFE_A
-    passed_s = np.abs(values_a[0] - values_a[on_ramp]) / RAMP_A_PER_S
+    passed_s = (LEVEL_A - values_a[on_ramp]) / RAMP_A_PER_S
     return float((times_ns[on_ramp] * 1e-9 - passed_s).min())
 
 
-HOLD = {"kind": "hold", "unit": "A", "level": 4.0, "duration_s": 60.0, "soft_start_s": 0.2}
+HOLD = {"kind": "hold", "unit": "A", "level": LEVEL_A, "duration_s": 60.0, "soft_start_s": 0.2}
 
 
 def killed(stage, targets):
@@ -175,7 +176,7 @@ def test_an_axis_that_is_lost_delays_no_other_and_is_never_confirmed(stage, faul
     assert printed["guardian_active"]
     assert printed["reason"].startswith("y: ")
     times_ns, values_a = made.writes("x")
-    ramp_ns = times_ns[np.flatnonzero(values_a > 4.0 - SAFE_A)[-1] :]
+    ramp_ns = times_ns[np.flatnonzero(values_a > LEVEL_A - SAFE_A)[-1] :]
     on_ramp = np.diff(ramp_ns[: np.count_nonzero(values_a[-ramp_ns.size :] > SAFE_A) + 1])
     # The first gap is that of the exchange that y did not answer.
     assert on_ramp[1:].max() * 1e-9 < TIMEOUT_S / 5.0
