@@ -409,7 +409,8 @@ class Loop:
     def _lost_device(self, error: DeviceError) -> LoopOutcome:
         # Those in whose exchange it failed; none if a watchdog or a pulse did.
         lost = [each for each in self._chains if each.lane.unanswered]
-        said = lost[0].named(str(error)) if lost else str(error)
+        names = ", ".join(each.plan.name for each in lost if each.plan.name)
+        said = f"{names}: {error}" if names else str(error)
         for chain in () if lost else self._chains:
             chain.lane.unanswered = True
         text = said if self._code == "completed" else f"{self._reason}; then {said}"

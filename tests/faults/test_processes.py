@@ -59,7 +59,7 @@ def test_killed_and_stopped_processes_leave_a_safe_output_and_a_whole_recording(
     words += ["--within-ms", "1500", "--max-step", "2"]  # others may have the machine
     words += ["--action", action, "--targets", targets, "--phase", phase]
     done = ended([*words, "--stall-s", str(stall_s)], cwd=ROOT)
-    (found,) = json.loads(done.stdout)
+    found = json.loads(done.stdout)
     assert (found["phase"], found["lost"], found["reader"]) == (phase, 0, "")
     assert action in found["hit"]
 
