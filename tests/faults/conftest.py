@@ -232,7 +232,8 @@ class Emulated:
         command += ["--log", str(self.log.path)]
         self.process = subprocess.Popen(command, stdout=subprocess.PIPE, text=True)
         assert self.process.stdout is not None
-        self.addresses = [self.process.stdout.readline().split()[-1] for _ in range(lines)]
+        said = [self.process.stdout.readline() for _ in range(lines)]
+        self.addresses = [each.partition(" answers at ")[2].split()[0] for each in said]
 
     @property
     def address(self) -> str:

@@ -4,6 +4,7 @@ The devices' own logs are evaluated. No device has a watchdog: it keeps its last
 """
 
 import copy
+import json
 import os
 import signal
 import time
@@ -108,17 +109,43 @@ class Stage:
         if self.run is not None:
             self.run.process.kill()
             self.run.process.communicate()
-        for device, _ in self.devices.values():
+        for device in {device for device, _ in self.devices.values()}:
             device.end()
+
+
+class OneDevice(Stage):
+    """A run of two axes on two outputs of one emulated device."""
+
+    def __init__(self, folder, *words):
+        sections = {
+            name: {
+                "device": {
+                    **copy.deepcopy(T7),
+                    "output": output,
+                    "input": source,
+                    "timeout_s": TIMEOUT_S,
+                }
+            }
+            for name, output, source in (("x", "DAC0", "AIN0"), ("y", "DAC1", "AIN1"))
+        }
+        wiring = folder / "wiring.yaml"
+        text = {**EXPERIMENT, "device": {"host": "127.0.0.1", "tcp_port": 502}, "axes": sections}
+        wiring.write_text(json.dumps(text), encoding="utf-8")
+        device = Emulated(folder, str(wiring), "--port", "0", *words)
+        self.folder, self.run = folder, None
+        self.devices = {"x": (device, "DAC0"), "y": (device, "DAC1")}
+        self.sections = sections
+        for each in sections.values():
+            each["device"] |= tcp(device.address)
 
 
 @pytest.fixture
 def stage(tmp_path, profile):
-    """Return a function that emulates the devices of a stage."""
+    """Return a function that emulates the devices of a stage; one for all axes without kinds."""
     made = []
 
-    def emulated(**kinds):
-        made.append(Stage(tmp_path, kinds, profile))
+    def emulated(*words, **kinds):
+        made.append(Stage(tmp_path, kinds, profile) if kinds else OneDevice(tmp_path, *words))
         return made[-1]
 
     yield emulated
@@ -214,3 +241,27 @@ def test_a_device_that_does_not_open_moves_nothing(stage):
     assert set(made.writes("x")[1]) <= {-10.0}
     assert not any(each.exists() for each in made.outputs)
     assert runs() == []
+
+
+@pytest.mark.parametrize("targets", each_kind(["loop", "guardian+loop", "supervisor"], {"loop"}))
+def test_killed_processes_leave_both_outputs_of_one_device_safe(stage, targets):
+    made = stage().start(waveform=HOLD).await_running()
+    at_ns = killed(made, targets)
+    made.run.process.communicate(timeout=240)
+    made.await_safe()
+    if targets == "loop":
+        made.assert_one_ramp(at_ns)
+    for each in active():
+        assert said("stop", "--run", each["name"])["ended"]
+    x, y = made.assert_complete()
+    assert x.run["device.transactions"] == y.run["device.transactions"] == "1"
+    np.testing.assert_array_equal(x.ticks.late_ns, y.ticks.late_ns)
+    np.testing.assert_array_equal(x.ticks.exchange_ns, y.ticks.exchange_ns)
+
+
+def test_a_lost_device_is_lost_for_both_axes(stage):
+    made = stage("--fault", "reset@300").start(waveform=HOLD)
+    printed = made.ended()
+    assert printed["code"] == "fault"
+    made.await_safe()
+    made.assert_complete()
