@@ -5,10 +5,12 @@ writes (:meth:`hilctl.base.device.Device.make_safe`) and never retries.
 """
 
 import errno
+import os
 import threading
 import time
 from collections.abc import Callable, Iterable, Sequence
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import suppress
 from dataclasses import dataclass
 from typing import Literal, NamedTuple, Protocol, TypeAlias, TypeVar, cast
 
@@ -290,12 +292,25 @@ def drive_to_safe(
     if len(lines) == 1:
         drive(lines[0])
         return
-    with ThreadPoolExecutor(len(lines)) as threads:
+    with ThreadPoolExecutor(len(lines), initializer=_same_priority()) as threads:
         try:
             for each in [threads.submit(drive, line) for line in lines]:
                 each.result()
         finally:
             ending.set()  # Ctrl-C
+
+
+def _same_priority() -> Callable[[], None]:
+    """Return a function that gives a new thread the priority of this one; it starts without."""
+    if not hasattr(os, "sched_getscheduler"):  # not Linux
+        return lambda: None
+    policy, parameters = os.sched_getscheduler(0), os.sched_getparam(0)
+
+    def apply() -> None:
+        with suppress(OSError):
+            os.sched_setscheduler(0, policy, parameters)
+
+    return apply
 
 
 _WORST: tuple[OutputState, ...] = ("unknown", "sent", "set", "confirmed")

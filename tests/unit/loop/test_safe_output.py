@@ -1,6 +1,7 @@
 """The ramp of an output to the safe value, until the device confirms it."""
 
 import errno
+import os
 import threading
 from types import SimpleNamespace
 
@@ -249,3 +250,19 @@ def test_several_outputs_are_as_safe_as_the_worst_of_them(states, worst, named):
     joint = joint_report(reports, NAMES)
     assert (joint.state, joint.final) == (worst, named == "")
     assert {name for name in NAMES if name in joint.error.replace("may", "")} == {*named}
+
+
+def test_threads_of_lines_have_the_priority_of_their_caller(monkeypatch):
+    """A new thread starts with the ordinary one, and would be late on a busy machine."""
+    applied = []
+    monkeypatch.setattr(os, "sched_getscheduler", lambda process: os.SCHED_FIFO)
+    monkeypatch.setattr(os, "sched_getparam", lambda process: os.sched_param(80))
+    monkeypatch.setattr(
+        os,
+        "sched_setscheduler",
+        lambda _, policy, parameters: applied.append((policy, parameters.sched_priority)),
+    )
+    x, y = Amplifier(), Amplifier()
+    y.clock = x.clock
+    drive_to_safe(outputs_of(x, y, start=0.0), x.sleep)
+    assert {*applied} == {(os.SCHED_FIFO, 80)}
