@@ -61,7 +61,7 @@ class WiredExperiment:
 
     def words(self, emulators: Sequence[Emulator]) -> list[str]:
         """Return the arguments of ``hilctl`` that run it on emulators, at any addresses."""
-        settings = [*self.settings]
+        found: dict[str, dict[str, Any]] = {}
         for axis in self.axes:
             emulator = emulators[axis.device]
             places: dict[str, Any] = {
@@ -72,8 +72,16 @@ class WiredExperiment:
             own, profile = axis.section.get("unit_id"), emulator.device.profile
             if own is not None and isinstance(profile, ModbusProfile) and own != profile.unit_id:
                 places["unit_id"] = profile.unit_id
-            above = f"axes.{axis.name}." if axis.name else ""
-            settings += [f"{above}device.{k}={v}" for k, v in _differing(places, axis.section)]
+            above = f"axes.{axis.name}.device" if axis.name else "device"
+            found[above] = dict(_differing(places, axis.section))
+        # A key of all axes that each axis sets would have no effect.
+        replaced = {f"device.{key}" for key in set.intersection(*map(set, found.values()))}
+        settings = [
+            each for each in self.settings if each.partition("=")[0].strip() not in replaced
+        ]
+        settings += [
+            f"{above}.{key}={value}" for above, each in found.items() for key, value in each.items()
+        ]
         return ["run", str(self.path), *(word for each in settings for word in ("--set", each))]
 
 

@@ -191,6 +191,14 @@ class TestAxes:
             f"axes.y.device.tcp_port={second}",
         ]
 
+    def test_a_place_of_all_axes_is_replaced(self, path):
+        words = ["--set", "device.tcp_port=502", "--set", "name=other"]
+        said, settings = said_of(path, *words)
+        port = said["devices"][0]["address"].rpartition(":")[2]
+        assert settings == [
+            "name=other", f"axes.x.device.tcp_port={port}", f"axes.y.device.tcp_port={port}",
+        ]  # fmt: skip
+
     def test_one_axis_is_emulated_alone(self, path):
         said, settings = said_of(path, "--set", "axis=y")
         assert said["wiring"]["output"] == "DAC1"
