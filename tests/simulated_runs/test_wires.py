@@ -212,3 +212,46 @@ def test_a_piezo_is_rehearsed(tmp_path):
     )
     # 80 % of 50 um at 100 V, and less than proportionally at 80 V.
     assert (command_v.max(), displacement_um.max()) == pytest.approx((80.0, 31.2), abs=0.3)
+
+
+@pytest.mark.slow
+def test_a_raster_of_two_axes_on_one_device(tmp_path):
+    """Both are in one scan list: each sample of both has the same scan."""
+    path, log, output = (
+        ROOT / "configs" / "raster.yaml",
+        tmp_path / "log.jsonl",
+        tmp_path / "r.mcap",
+    )
+    shorter = {
+        "device.tcp_port": 502,  # so the emulator takes a free one
+        "device.timeout_s": 5.0, "timing.max_late_s": 5.0,
+        "axes.x.waveform.duration_s": 1.6, "axes.y.waveform.levels": "[4.0, 6.0]",
+    }  # fmt: skip
+    settings = [word for pair in shorter.items() for word in ("--set", "{}={}".format(*pair))]
+    command = typed("emulate", path, "--log", log, "--json", *settings)
+    with subprocess.Popen(command, stdout=subprocess.PIPE, text=True, cwd=tmp_path) as process:
+        try:
+            assert process.stdout is not None
+            make_real_time(process.pid)
+            arguments = json.loads(process.stdout.readline())["arguments"]
+            hilctl(*arguments, "--output", output)
+        finally:
+            process.terminate()
+    x, y = (read(output.with_suffix(f".{axis}.mcap")) for axis in "xy")
+    assert [each.end["code"] for each in (x, y)] == ["completed"] * 2
+    assert x.samples.index.tolist() == y.samples.index.tolist()
+    for recording, error_um in ((x, 0.4), (y, 0.3)):
+        samples, late = recording.samples, slice(2000, 6000)
+        found_um = samples.displacement_um[late] - samples.reference_um[late]
+        assert np.abs(found_um).max() < error_um
+    assert replay(y).identical
+    played = [json.loads(line) for line in log.read_text(encoding="utf-8").splitlines()]
+    scans = {
+        axis: [
+            (each["monotonic_ns"], each["first"], each["samples"])
+            for each in played
+            if each["event"] == "played" and each["axis"] == axis
+        ]
+        for axis in "xy"
+    }
+    assert scans["x"] == scans["y"] != []
