@@ -220,9 +220,9 @@ class CouplingStudy:
         parts = motion if axis == moving else [_hold(seconds)]
         middle_um = self._middles_um[axis]
         parts = [{"offset": middle_um, "rest": middle_um} | each for each in parts]
-        for end, soft in ((0, "soft_start_s"), (-1, "soft_end_s")):
-            parts[end].pop("rest", None)  # that of the model
-            parts[end][soft] = _SOFT_S
+        # The safe ramp follows: a drive of one sign has no command for a soft end at rest.
+        parts[0].pop("rest", None)  # that of the model
+        parts[0]["soft_start_s"] = _SOFT_S
         # All keys of a sequence, so that none of the experiment's own waveform is left.
         return {"kind": "sequence", "unit": "um", "repeat": 1, "parts": parts}
 
@@ -235,7 +235,7 @@ class CouplingStudy:
                 "first_hz": self._step_hz,
                 "last_hz": self._highest_hz,
                 "step_hz": self._step_hz,
-                "duration_s": 2.0 * _SOFT_S + (_PERIODS + _SETTLING) / self._step_hz,
+                "duration_s": _SOFT_S + (_PERIODS + _SETTLING) / self._step_hz,
             }
         ]
 
