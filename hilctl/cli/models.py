@@ -26,6 +26,7 @@ from hilctl.lab.identify.refinement import Refinement
 from hilctl.lab.identify.registry import all_fits
 from hilctl.lab.identify.settings import setting_rows
 from hilctl.lab.identify.summary import (
+    candidate_table,
     change_tables,
     loop_table,
     parameter_texts,
@@ -316,6 +317,8 @@ def print_identification(result: Identification, output: Path | None) -> None:
     if held_out is not None:
         loops = loop_table(held_out.judgement.errors)
         print_rich(table(f"validation: {held_out.how}", *loops, left={"loop"}))
+    if result.candidates:
+        print_rich(table("kinds of model", *candidate_table(result), left={"tried"}))
     title = f"fit: {fit.model.provenance.method}"
     print_rich(table(title, *loop_table(fit.errors), left={"loop"}))
     if parameters := ", ".join(f"{name} {text}" for name, text in parameter_texts(fit)):

@@ -13,12 +13,13 @@ from hilctl.lab.identify.model_quality import Verdict
 from hilctl.lab.identify.pipeline import Identification
 from hilctl.lab.identify.refinement import Refinement
 from hilctl.lab.identify.summary import (
+    candidate_table,
     change_tables,
+    details,
     loop_table,
     parameter_texts,
     refinement_lines,
     stroke_table,
-    summary,
 )
 from hilctl.lab.pages import html
 from hilctl.lab.pages.figure_layout import FigureSpec, Panel
@@ -35,8 +36,10 @@ def identification_page(found: Identification) -> str:
     """Return the page as HTML."""
     fit = found.fit
     unit = fit.model.input_unit
-    body = _head(fit.model, [*summary(found), fit.model.provenance.method])
-    body += errors_by_stroke(found.verdict)
+    body = [*errors_by_stroke(found.verdict), *map(html.paragraph, found.verdict.notes)]
+    body += _head(fit.model, [*details(found), fit.model.provenance.method])
+    if found.candidates:
+        body += ["<h2>Kinds of model</h2>", html.grid(*candidate_table(found))]
     if (held_out := found.held_out) is not None:
         body += ["<h2>Errors on held-out data</h2>"]
         body += [html.grid(*loop_table(held_out.judgement.errors))]
@@ -60,7 +63,7 @@ def _head(model: HysteresisModel, lines: Sequence[str]) -> list[str]:
 
 
 def errors_by_stroke(verdict: Verdict) -> list[str]:
-    """Return the errors of a verdict by stroke, as a section with a table and a figure."""
+    """Return the grade and the errors of a verdict by stroke, with a table and a figure."""
 
     def draw(axes: Axes) -> None:
         strokes = [100.0 * STROKES[each.label] for each in verdict.classes]
@@ -76,6 +79,7 @@ def errors_by_stroke(verdict: Verdict) -> list[str]:
     figure = FigureSpec("strokes", caption, (Panel(draw, height=0.5),))
     return [
         "<h2>Errors by stroke</h2>",
+        html.paragraph(verdict.headline),
         html.grid(*stroke_table(verdict)),
         html.figures([figure]),
     ]

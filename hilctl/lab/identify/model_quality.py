@@ -53,6 +53,14 @@ class Verdict:
         within = {"good": "good: within", "usable": "usable within"}.get(self.grade, "poor: within")
         return f"{within} {percent}, on held-out data"
 
+    @property
+    def headline(self) -> str:
+        """The grade, or why it is not a model; the errors are those of :attr:`classes`."""
+        if self.reasons:
+            return str(self)
+        unknown = "no validation data, so the error elsewhere is unknown"
+        return f"{self.grade}: {'errors on held-out data' if self.held_out else unknown}"
+
     def to_mapping(self) -> dict[str, Any]:
         """Return the fields as plain values."""
         return asdict(self) | {"text": str(self)}

@@ -5,7 +5,7 @@ from typing import TypeAlias
 
 from hilctl.lab.identify.evaluation import Evaluation, LoopScore, StrokeError
 from hilctl.lab.identify.fit_model import FittedModel
-from hilctl.lab.identify.model_quality import Verdict
+from hilctl.lab.identify.model_quality import Verdict, grade_of
 from hilctl.lab.identify.pipeline import Identification
 from hilctl.lab.identify.refinement import Refinement
 
@@ -42,19 +42,19 @@ def _mark(fit: FittedModel, name: str) -> str:
 
 def summary(found: Identification) -> list[str]:
     """Return the result in a few lines, the grade first."""
+    return [str(found.verdict), *found.verdict.notes, *details(found)]
+
+
+def details(found: Identification) -> list[str]:
+    """Return the lines of the summary below its verdict."""
     fit, held_out, known = found.fit, found.held_out, found.fit.model.provenance.identified_range
     spread = [start.rms_percent for start in fit.starts]
     ended = f"{fit.numbers} fitted parameters"
     if spread:
         ended = f"{len(spread)} starts ended at rms {min(spread):.3f} to {max(spread):.3f} %"
-    lines = [str(found.verdict), *found.verdict.notes, *found.understood]
+    lines = [*found.understood]
     if held_out is not None:
         lines.append(f"not fitted: {_errors(held_out.judgement)}; {held_out.how}")
-    lines += [
-        f"tried: {each.settings}: mean error by stroke {each.stroke_percent:.2f} %, "
-        f"peak error {each.peak_percent:.2f} %, rms {each.rms_percent:.2f} %"
-        for each in found.candidates
-    ]
     lines += [f"fitted: {_errors(fit)}", f"{ended}, in {fit.elapsed_s:.2f} s"]
     if known is not None:
         lines.append(
@@ -108,8 +108,29 @@ def _change_table(
 
 
 def stroke_table(verdict: Verdict) -> Table:
-    """Return the errors of each class of motions."""
-    return ("stroke", "peak %", "rms %", "motions"), [
-        (*_row(each.label, each.peak_percent, each.rms_percent), f"{each.motions}")
+    """Return the errors of each class of motions, the promised one and its grade first."""
+    # Small errors are only usable if the data do not cover other motions.
+    covered = verdict.held_out and verdict.grade in {"poor", grade_of(verdict.classes)}
+    return ("stroke", "promised %", "grade", "rms %", "motions"), [
+        (
+            *_row(each.label, each.peak_percent),
+            grade_of([each], known=covered),
+            f"{each.rms_percent:.3g}",
+            f"{each.motions}",
+        )
         for each in verdict.classes
+    ]
+
+
+def candidate_table(found: Identification) -> Table:
+    """Return the kinds of model that were tried, with their errors on held-out data."""
+    return ("tried", "mean by stroke %", "peak %", "rms %"), [
+        (
+            each.settings,
+            *(
+                f"{percent:.2f}"
+                for percent in (each.stroke_percent, each.peak_percent, each.rms_percent)
+            ),
+        )
+        for each in found.candidates
     ]

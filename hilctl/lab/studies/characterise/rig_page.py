@@ -12,7 +12,7 @@ from matplotlib.axes import Axes
 from hilctl.base.formatting import quantity, significant
 from hilctl.base.types import F64
 from hilctl.lab.identify.model_page import drawn_records, errors_by_stroke
-from hilctl.lab.identify.summary import loop_table, summary
+from hilctl.lab.identify.summary import candidate_table, details, loop_table
 from hilctl.lab.pages import html
 from hilctl.lab.pages.figure_layout import FigureSpec, Panel
 from hilctl.lab.pages.plot_style import (
@@ -183,10 +183,9 @@ def _held_out(found: Characterisation) -> list[str]:
     first = found.held_out[0]
     noise = f"Expected from sensor noise alone: {first.floor_percent:.2g} %."
     return [
-        "<h2>Validation errors</h2>",
-        html.paragraph(f"Verdict: {found.verdict}. {noise}"),
-        *map(html.paragraph, found.verdict.notes if found.verdict else ()),
         *(errors_by_stroke(found.verdict) if found.verdict else ()),
+        html.paragraph(noise),
+        *map(html.paragraph, found.verdict.notes if found.verdict else ()),
         "<h2>Errors by reference</h2>",
         html.grid(HELD_OUT_HEADINGS, held_out_rows(found)),
         html.figures(
@@ -224,7 +223,9 @@ def _model(found: Characterisation) -> Iterator[str]:
     fit = known.fit
     yield "<h2>Model</h2>"
     yield html.paragraph(fit.model.provenance.method)
-    yield from map(html.paragraph, summary(known))
+    yield from map(html.paragraph, details(known))
+    if known.candidates:
+        yield html.grid(*candidate_table(known))
     yield html.grid(*loop_table(fit.errors))
     yield from drawn_records(fit, known.data, fit.model.input_unit)
     yield html.details("Model file", dump_model(fit.model))

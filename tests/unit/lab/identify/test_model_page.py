@@ -40,7 +40,7 @@ def test_the_page_fetches_nothing_and_shows_names_as_they_are(page_of):
     assert "&lt;a &amp; b&gt;.csv" in page
     assert "<a & b>" not in page
     assert "not fitted" not in page
-    assert "fit error" in page
+    assert "no validation data" in page
 
 
 @pytest.mark.usefixtures("undrawn")

@@ -1,5 +1,6 @@
 """What was found, in rows and lines."""
 
+from dataclasses import replace
 from types import SimpleNamespace
 
 import pytest
@@ -7,7 +8,13 @@ import pytest
 from hilctl.lab.identify.evaluation import LoopScore, StrokeError
 from hilctl.lab.identify.model_quality import Verdict
 from hilctl.lab.identify.model_selection import CandidateScore
-from hilctl.lab.identify.summary import loop_table, parameter_texts, summary
+from hilctl.lab.identify.summary import (
+    candidate_table,
+    loop_table,
+    parameter_texts,
+    stroke_table,
+    summary,
+)
 from hilctl.models.base import IdentifiedRange, Provenance
 
 
@@ -73,4 +80,21 @@ def test_the_range_that_it_was_found_for_is_said():
 def test_every_kind_that_was_tried_is_said_with_its_error():
     tried = found()
     tried.candidates = (CandidateScore("kind ppi", 0.5, 2.0, 0.7),)
-    assert any("kind ppi" in line and "0.70 %" in line for line in summary(tried))
+    assert candidate_table(tried)[1] == [("kind ppi", "0.70", "2.00", "0.50")]
+
+
+def test_each_stroke_has_its_promise_and_its_grade():
+    classes = [StrokeError("full stroke", 1.5, 0.5, 3), StrokeError("half stroke", 4.0, 1.0, 2)]
+    classes += [StrokeError("tenth stroke", 11.0, 2.0, 1)]
+    verdict = Verdict("poor", 11.0, held_out=True, classes=tuple(classes))
+    rows = [row[:3] for row in stroke_table(verdict)[1]]
+    assert rows == [
+        ("full stroke", "1.5", "good"),
+        ("half stroke", "4", "usable"),
+        ("tenth stroke", "11", "poor"),
+    ]
+    guessed = replace(verdict, held_out=False)
+    narrow = replace(verdict, grade="usable", classes=tuple(classes[:1]))
+    for each in (guessed, narrow):
+        assert stroke_table(each)[1][0][2] == "usable"
+    assert (verdict.headline.split(":")[0], "validation" in guessed.headline) == ("poor", True)
