@@ -170,8 +170,8 @@ def test_learn_refuses_existing_files(learn, tmp_path):
     (tmp_path / "correction-runs").mkdir()
     (tmp_path / "correction-runs" / "run-00.mcap").touch()
     code, _, err = learn()
-    assert (code, "--folder" in err) == (2, True)
+    assert (code, "another folder" in err) == (2, True)
     (tmp_path / "correction.yaml").write_text("mine")
     code, _, err = learn()
-    assert (code, "--overwrite" in err) == (2, True)
+    assert (code, "overwrite" in err) == (2, True)
     assert (tmp_path / "correction.yaml").read_text() == "mine"

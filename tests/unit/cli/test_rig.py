@@ -110,7 +110,7 @@ def test_message_of_a_stop_or_fault_says_how_to_resume(ends, command, error, cod
 def test_existing_model_is_refused(ends, command, tmp_path):
     (tmp_path / "model.yaml").write_text("mine")
     code, _, err = command()
-    assert (code, "--overwrite" in err) == (2, True)
+    assert (code, "overwrite" in err) == (2, True)
     assert "ran" not in ends
     command("--overwrite")
     assert ends["discarded"]
@@ -120,7 +120,7 @@ def test_existing_page_is_refused(command, tmp_path):
     """A page of this characterisation (with its recordings) is replaced."""
     (tmp_path / "model.html").write_text("mine")
     code, _, err = command()
-    assert (code, "--overwrite" in err) == (2, True)
+    assert (code, "overwrite" in err) == (2, True)
     (tmp_path / "model-runs").mkdir()
     (tmp_path / "model-runs" / "01-rest.mcap").touch()
     assert command()[0] == 0
