@@ -75,7 +75,7 @@ def test_lag_is_found_and_reported(tables, tmp_path, capsys):
 
 def test_a_unit_that_was_not_recorded_is_refused():
     golden = Path(__file__).parents[4] / "recordings" / "golden" / "terfenol_uncompensated.mcap"
-    with pytest.raises(InputError, match="--unit must be A"):
+    with pytest.raises(InputError, match="unit must be A"):
         api.identify(golden, model="straight", settings=["table.unit=V"])
 
 

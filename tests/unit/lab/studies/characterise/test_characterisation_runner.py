@@ -145,7 +145,7 @@ def test_a_multisine_with_gaps_is_run_again_though_the_run_has_few(
 def test_recordings_with_other_settings_are_not_replaced(experiment):
     run(experiment, Rig())
     rig = Rig()
-    with pytest.raises(InputError, match="--overwrite"):
+    with pytest.raises(InputError, match="overwrite"):
         run(experiment, rig, "limits.peak_current_a=3.0")
     assert rig.names == []
 
