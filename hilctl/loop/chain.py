@@ -74,7 +74,7 @@ class AxisChain:
         self._tuner = ReferenceTuner()
         self._compensator = plan.compensator
         self._size, self._latency_blocks = block, latency_blocks
-        self._attributes = [name for name, there in _has(device).items() if there]
+        self._attributes = _filled_by(device)
         self._in_flight: deque[Block] = deque()
         self._missing = 0  # samples dropped since the last recorded block
 
@@ -377,11 +377,9 @@ class JointChains:
             chain.end_exchange(block, duration_ns)
 
 
-def _has(device: Device) -> dict[str, bool]:
-    """Return the attributes of a device that an exchange may fill."""
+def _filled_by(device: Device) -> list[str]:
+    """Return the attributes of a device that an exchange fills."""
     info = device.info
-    return {
-        "reading_age_s": info.ages_readings,
-        "reading_um": info.corrects_readings,
-        "aux": bool(info.aux),
-    }
+    filled = {"reading_age_s": info.ages_readings, "reading_um": info.corrects_readings,
+              "aux": bool(info.aux)}  # fmt: skip
+    return [name for name, there in filled.items() if there]

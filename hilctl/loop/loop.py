@@ -10,11 +10,11 @@ the ramp the loop repeats the safe value until the last answer has arrived.
 """
 
 import math
-from collections.abc import Callable, Sequence
+from collections.abc import Sequence
 from enum import Enum
 from typing import cast
 
-from hilctl.base.device import Device, DigitalDevice, JointDevice, Units, WatchdogDevice
+from hilctl.base.device import Device, DigitalDevice, JointDevice, WatchdogDevice, joined
 from hilctl.base.errors import DeviceError, InputError
 from hilctl.base.events import OFFSET, TRIGGERED, Event
 from hilctl.base.samples import Flag
@@ -52,16 +52,11 @@ _ARM_MARGIN_NS = 1_000_000  # arming too early costs nothing; too late, it delay
 class Loop:
     """Run one plan on its open devices, one per axis, in a host.
 
-    Devices are exchanged in turn, those of a joint device in ``units`` at once.
+    Attributes:
+        units: What is opened, exchanged in turn, and closed: devices, and joint devices.
     """
 
-    def __init__(
-        self,
-        plan: LoopPlan,
-        devices: Sequence[Device],
-        host: Host,
-        units: Units | None = None,
-    ) -> None:
+    def __init__(self, plan: LoopPlan, devices: Sequence[Device], host: Host) -> None:
         period_ns = plan.block / plan.sample_rate_hz * 1e9
         self._plan = plan
         self._devices = devices
@@ -74,12 +69,18 @@ class Loop:
             )
             for axis, device, lane in zip(plan.axes, devices, host.lanes, strict=True)
         ]  # fmt: skip
-        self._exchanges = _exchanges(self._chains, units or {})
+        by_name = {each.plan.name: each for each in self._chains}
+        self.units = joined({name: each.device for name, each in by_name.items()})
+        self._exchanges = [
+            by_name[names[0]].exchange
+            if len(names) == 1
+            else JointChains(cast(JointDevice, unit), [by_name[each] for each in names]).exchange
+            for names, unit in self.units.items()
+        ]
         self._controlled = [each for each in self._chains if each.plan.feedback is not None]
         self._apart: ApartInterlock | None = None
         if plan.apart is not None:
             self._apart = ApartInterlock(plan.apart, plan.sample_rate_hz)
-            by_name = {each.plan.name: each for each in self._chains}
             self._pair = [by_name[name] for name in plan.apart.axes]
         self._adapts = any(each.plan.adaptation is not None for each in self._chains)
         self._pacer = Pacer(host.clock, period_ns, plan.late_policy, plan.late_rules)
@@ -438,18 +439,3 @@ class Loop:
 
     def _sleep(self, wait_s: float) -> None:
         self._clock.sleep_until_ns(self._clock.now_ns() + round(wait_s * 1e9))
-
-
-def _exchanges(
-    chains: Sequence[AxisChain], units: Units
-) -> list[Callable[[int, int, Callable[[], int]], None]]:
-    """Return the exchanges of a tick; a joint one takes the place of its first axis."""
-    by_name = {each.plan.name: each for each in chains}
-    exchanges = {name: each.exchange for name, each in by_name.items()}
-    for names, unit in units.items():
-        if len(names) > 1:
-            members = [by_name[each] for each in names]
-            exchanges[names[0]] = JointChains(cast(JointDevice, unit), members).exchange
-            for each in names[1:]:
-                del exchanges[each]
-    return [*exchanges.values()]

@@ -16,7 +16,7 @@ from pathlib import Path
 
 import numpy as np
 
-from hilctl.base.device import Clock, Device, JointDevice, Units, joined
+from hilctl.base.device import Clock, Device, JointDevice
 from hilctl.base.errors import HilctlError, InputError, RunError
 from hilctl.base.files import TextFiles
 from hilctl.base.segments import Segment
@@ -189,16 +189,15 @@ def run_job(job: Job, rings: Sequence[SampleRing]) -> LoopOutcome:
     loaded = [loaded_of(each) for each in job.axes]
     config, page = loaded[0].config, rings[0].page
     devices = [each.device for each in loaded]
-    units = joined({each.axis: each.device for each in loaded})
     host = RingHost(rings, SystemClock(), job.supervisor, job.silence_s)
     plan = plan_of(job, loaded)
-    loop = Loop(plan, devices, host, units)
+    loop = Loop(plan, devices, host)
     # After the warm-up, so that all its memory is locked; before a device is opened, so that a
     # refusal moves nothing.
     steps = prepare(config.realtime)
     if config.realtime.require:
         require(steps)
-    start_ns = _start(loop, loaded, units, rings, host, steps)
+    start_ns = _start(loop, loaded, rings, host, steps)
     try:
         if not plan.waits:  # until it starts, arming and readings are no hang
             page.publish(PageField.PHASE, Phase.RUNNING)
@@ -211,7 +210,7 @@ def run_job(job: Job, rings: Sequence[SampleRing]) -> LoopOutcome:
         _make_safe(job, devices, rings, error)
         raise
     finally:
-        close_all(units.values())
+        close_all(loop.units.values())
         page.leave_lateness(loop.lateness)
     return outcome
 
@@ -219,7 +218,6 @@ def run_job(job: Job, rings: Sequence[SampleRing]) -> LoopOutcome:
 def _start(
     loop: Loop,
     loaded: Sequence[LoadedExperiment],
-    units: Units,
     rings: Sequence[SampleRing],
     host: RingHost,
     steps: Sequence[SetUpStep],
@@ -235,7 +233,7 @@ def _start(
     _await(PageField.HAS_DEVICE, page, host)
     opened: list[Device | JointDevice] = []
     try:
-        for unit in units.values():
+        for unit in loop.units.values():
             unit.open(config.sample_rate_hz, config.block)
             opened.append(unit)
         outputs = [starting_output(each.device, each.config.safe.at_start) for each in loaded]

@@ -12,7 +12,7 @@ from pathlib import Path
 import numpy as np
 
 from hilctl.base.alarm import PATIENCE_S, alarm, time_limit
-from hilctl.base.device import Clock, Device, JointDevice, Units, joined
+from hilctl.base.device import Clock, Device
 from hilctl.base.errors import DeviceError, HilctlError, InputError
 from hilctl.base.events import Event
 from hilctl.base.samples import BlockBatch, Samples
@@ -215,18 +215,18 @@ def _run(run: CheckedRun, recorders: Sequence[Recorder]) -> tuple[LoopOutcome, L
         stop=refused,
     )
     devices = [each.loaded.device for each in run.axes]
-    units = joined(dict(zip(run.names, devices, strict=True)))
+    loop = Loop(plan, devices, host)
     at_start = [each.loaded.config.safe.at_start for each in run.axes]
     try:
-        loop, waveform_at = _opened(plan, devices, units, host, at_start)
+        waveform_at = _open(loop, plan, devices, at_start)
         start_unix_ns = time.time_ns()
         for recorder in recorders:
             recorder.begin(start_unix_ns, {"paced": "false"}, waveform_at)
     except HilctlError:
-        _closed(units.values())
+        _closed(loop)
         discard_all(recorders)
         raise
-    return _drive(loop, units, host)
+    return _drive(loop, host)
 
 
 def run_in_memory(plan: LoopPlan, devices: Sequence[Device]) -> tuple[LoopOutcome, list[Samples]]:
@@ -244,9 +244,9 @@ def run_in_memory(plan: LoopPlan, devices: Sequence[Device]) -> tuple[LoopOutcom
         on_batch=[partial(collect, parts=each) for each in lanes],
         on_event=[lambda event: None for _ in lanes],
     )
-    units = joined(dict(zip((each.name for each in plan.axes), devices, strict=True)))
-    loop, waveform_at = _opened(plan, devices, units, host, [None] * len(devices))
-    outcome, _ = _drive(loop, units, host)
+    loop = Loop(plan, devices, host)
+    waveform_at = _open(loop, plan, devices, [None] * len(devices))
+    outcome, _ = _drive(loop, host)
     return outcome, [_joined(parts, waveform_at) for parts in lanes]
 
 
@@ -257,43 +257,36 @@ def _joined(parts: list[Samples], waveform_at: int) -> Samples:
     return samples.rows(index >= waveform_at)
 
 
-def _opened(
-    plan: LoopPlan,
-    devices: Sequence[Device],
-    units: Units,
-    host: OfflineHost,
-    at_start: Sequence[float | None],
-) -> tuple[Loop, int]:
-    """Open the devices; return the loop, and the number of samples before the waveform."""
-    loop = Loop(plan, devices, host, units)
-    opened: list[Device | JointDevice] = []
+def _open(
+    loop: Loop, plan: LoopPlan, devices: Sequence[Device], at_start: Sequence[float | None]
+) -> int:
+    """Open the devices; return the number of samples before the waveform."""
     try:
         with time_limit():
-            for unit in units.values():
+            for unit in loop.units.values():
                 unit.open(plan.sample_rate_hz, plan.block)
-                opened.append(unit)
-            return loop, loop.begin_at([*map(starting_output, devices, at_start)])
+            return loop.begin_at([*map(starting_output, devices, at_start)])
     except HilctlError:
-        _closed(opened)
+        _closed(loop)
         raise
 
 
-def _drive(loop: Loop, units: Units, host: OfflineHost) -> tuple[LoopOutcome, Lateness]:
+def _drive(loop: Loop, host: OfflineHost) -> tuple[LoopOutcome, Lateness]:
     try:
         with alarm(host.check_exchange, PATIENCE_S):
             outcome = loop.run(0)
     finally:
-        failed = _closed(units.values())
+        failed = _closed(loop)
         host.flush()
     if failed:
         outcome = replace(outcome, code="fault", reason=f"{outcome.reason}; then {failed}")
     return outcome, loop.lateness
 
 
-def _closed(units: Iterable[Device | JointDevice]) -> str:
+def _closed(loop: Loop) -> str:
     """Close devices; return why that failed, or an empty text."""
     failed = []
-    for unit in units:
+    for unit in loop.units.values():
         try:
             with time_limit():
                 unit.close()

@@ -23,9 +23,7 @@ SINE = np.sin(2.0 * np.pi * 5.0 * np.arange(400) / RATE_HZ)
 class Stage:
     """A loop of two axes, to be run once."""
 
-    def __init__(
-        self, *devices, block=1, axes=(0, 1), ramps_per_s=(100.0, 40.0), models=None, join=False
-    ):
+    def __init__(self, *devices, block=1, axes=(0, 1), ramps_per_s=(100.0, 40.0), models=None):
         self.devices, self.clock = devices, FakeClock()
         models = models or [terfenol_rdpi(), None]
         plans, self.lanes = [], []
@@ -52,8 +50,7 @@ class Stage:
         self.plan = LoopPlan(
             axes=tuple(plans), block=block, latency_blocks=latency, sample_rate_hz=RATE_HZ
         )
-        units = joined(dict(zip("xyz", devices, strict=False))) if join else None
-        self.loop = Loop(self.plan, devices, self.host, units)
+        self.loop = Loop(self.plan, devices, self.host)
 
     def run(self):
         self.loop.begin_at([each.output() for each in self.devices])
@@ -167,7 +164,7 @@ class JoinableDevice(FakeDevice):
 
 def test_joined_devices_are_exchanged_at_once_with_the_results_of_devices_in_turn():
     one, other = JoinableDevice(), JoinableDevice()
-    stage = Stage(one, other, join=True)
+    stage = Stage(one, other)
     one.joint.clock = stage.clock
     assert stage.run().code == "completed"
     in_turn = Stage(FakeDevice(), FakeDevice())
@@ -198,9 +195,10 @@ def test_a_lost_joint_device_leaves_all_its_outputs_safe(latency):
             super().exchange(first_sample, *blocks)
 
     made = [devices(1, latency), devices(1, latency)]
+    joint = Lost(made, ["x", "y"])
+    made[0].join = lambda _: joint
     stage = Stage(*made)
-    joint = Lost(made, ["x", "y"], stage.clock)
-    stage.loop = Loop(stage.plan, made, stage.host, {("x", "y"): joint})
+    joint.clock = stage.clock
     outcome = stage.run()
     assert (outcome.code, outcome.output) == ("fault", "set")
     for axis, lane in enumerate(stage.lanes):
