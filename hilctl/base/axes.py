@@ -17,6 +17,7 @@ RUN_KEYS = {"name", "description", "labels", "sample_rate_hz", "block", "couplin
 """Keys of an experiment that are the same for all axes."""
 
 _T = TypeVar("_T")
+_Part = TypeVar("_Part")
 
 
 def names_text(names: Sequence[str]) -> str:
@@ -56,20 +57,24 @@ def axis_documents(document: Document) -> dict[str, Document]:
     return parts
 
 
-def of_each_axis(document: Document, made: Callable[[str, Document], _T]) -> dict[str, _T]:
-    """Return what a function makes of the name and document of each axis, by name.
+def of_each_axis(
+    parts: Mapping[str, _Part],
+    made: Callable[[str, _Part], _T],
+    joint: Iterable[ConfigProblem] = (),
+) -> dict[str, _T]:
+    """Return what a function makes of the name and part of each axis, by name.
 
-    Raise ConfigError with the problems of all axes.
+    Raise ConfigError with the problems of all axes, after the joint ones.
     """
     found, problems = dict[str, _T](), dict[str, Sequence[ConfigProblem]]()
-    for axis, part in axis_documents(document).items():
+    for axis, part in parts.items():
         problems[axis] = ()
         try:
             found[axis] = made(axis, part)
         except ConfigError as error:
             problems[axis] = error.problems
-    if any(problems.values()):
-        raise ConfigError(problems_of_axes(problems))
+    if every := [*joint, *problems_of_axes(problems)]:
+        raise ConfigError(every)
     return found
 
 

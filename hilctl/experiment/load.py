@@ -11,7 +11,13 @@ from dataclasses import dataclass, field
 from pathlib import Path
 from typing import TypeVar
 
-from hilctl.base.axes import AXIS_NAME, of_each_axis, one_axis_document, with_settings
+from hilctl.base.axes import (
+    AXIS_NAME,
+    axis_documents,
+    of_each_axis,
+    one_axis_document,
+    with_settings,
+)
 from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
 from hilctl.base.files import TextFiles, is_file
@@ -117,7 +123,8 @@ def resolve_axes(
 ) -> tuple[LoadedExperiment, ...]:
     """Build the experiment of each axis from a YAML document, see :func:`load_experiment`."""
     document = with_settings(document, settings)
-    loaded = of_each_axis(document, lambda axis, part: _resolved(part, folder, files, axis))
+    parts = axis_documents(document)
+    loaded = of_each_axis(parts, lambda axis, part: _resolved(part, folder, files, axis))
     return tuple(loaded.values())
 
 

@@ -5,16 +5,16 @@ in advance; the commands are compared with the limits.
 """
 
 import logging
-from collections.abc import Callable, Iterable, Iterator, Sequence
+from collections.abc import Iterator, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from typing import cast
 
 import numpy as np
 
-from hilctl.base.axes import problems_of_axes
+from hilctl.base.axes import of_each_axis
 from hilctl.base.device import JointDevice, joined
-from hilctl.base.errors import ConfigError, ConfigProblem, InputError, broken
+from hilctl.base.errors import ConfigProblem, InputError, broken
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import F64
 from hilctl.experiment.device_rules import (
@@ -191,7 +191,9 @@ def check_axes(loaded: Sequence[LoadedExperiment], heat_a2: float | None = 0.0) 
         ConfigError: The run is rejected; all reasons are listed.
     """
     now = MachineTime.now()
-    axes = _checked_each(loaded, lambda one: check(one, heat_a2, now), _joint_problems(loaded))
+    parts = {each.axis: each for each in loaded}
+    joint = _joint_problems(loaded)
+    axes = [*of_each_axis(parts, lambda _, one: check(one, heat_a2, now), joint).values()]
     samples = [each.reference.values.size for each in axes]
     longest = axes[samples.index(max(samples))]
     notes = []
@@ -202,32 +204,13 @@ def check_axes(loaded: Sequence[LoadedExperiment], heat_a2: float | None = 0.0) 
             notes.append(f"{ends} and holds its last value until {until}")
     crosstalk_um = _crosstalk(axes, max(samples))
     if notes or crosstalk_um:
-        axes = _checked_each(
-            loaded,
-            lambda one: check(one, heat_a2, now, max(samples), crosstalk_um.get(one.axis)),
+        again = of_each_axis(
+            parts, lambda axis, one: check(one, heat_a2, now, max(samples), crosstalk_um.get(axis))
         )
+        axes = [*again.values()]
     limits = {each.axis: each.config.command_limits() for each in loaded}
     notes += [*apart_notes(loaded[0].config.apart, limits), *_skew_notes(axes)]
     return CheckedRun(tuple(axes), (*notes,))
-
-
-def _checked_each(
-    loaded: Sequence[LoadedExperiment],
-    checked: Callable[[LoadedExperiment], CheckedExperiment],
-    joint: Iterable[ConfigProblem] = (),
-) -> list[CheckedExperiment]:
-    """Return the checked axes; raise ConfigError with their problems and the joint ones."""
-    axes = list[CheckedExperiment]()
-    problems: dict[str, Sequence[ConfigProblem]] = {}
-    for one in loaded:
-        problems[one.axis] = ()
-        try:
-            axes.append(checked(one))
-        except ConfigError as error:
-            problems[one.axis] = error.problems
-    if found := [*joint, *problems_of_axes(problems)]:
-        raise ConfigError(found)
-    return axes
 
 
 def _crosstalk(axes: Sequence[CheckedExperiment], samples: int) -> dict[str, F64]:

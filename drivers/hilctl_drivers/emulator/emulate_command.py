@@ -112,7 +112,7 @@ def wired_experiment(
         return options, rig, part.data["device"]
 
     devices, axes = dict[Any, EmulatorOptions](), list[WiredAxis]()
-    for name, (options, rig, section) in of_each_axis(document, wired).items():
+    for name, (options, rig, section) in of_each_axis(axis_documents(document), wired).items():
         place = _place(options)
         made = devices.get(place) or _emulator_options(options, path.parent, host, port)
         devices[place] = replace(made, rigs=(*made.rigs, rig))

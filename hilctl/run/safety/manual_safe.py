@@ -8,7 +8,7 @@ from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
 
-from hilctl.base.axes import of_each_axis, with_settings
+from hilctl.base.axes import axis_documents, of_each_axis, with_settings
 from hilctl.base.device import Device
 from hilctl.base.errors import ConfigError, ConfigProblem, HilctlError, RunError
 from hilctl.base.files import TextFiles
@@ -64,7 +64,8 @@ def put_safe(
         InputError: The file is not valid, or a run holds a device; nothing was sent.
     """
     document = with_settings(load_document(path), settings)
-    axes = of_each_axis(document, lambda _, part: _device_and_value(path, part))
+    parts = axis_documents(document)
+    axes = of_each_axis(parts, lambda _, part: _device_and_value(path, part))
     outputs = list[SafeOutput]()
     infos = [device.info for device, _ in axes.values()]
     places = [OutputPlace(info.holds, info.output) for info in infos]
