@@ -156,6 +156,13 @@ class AsciiSession(SteppedSession):
         """
         return _matched(text, forms, self._transact(text, forms[0].example))
 
+    def order(self, text: str, reply: Reply | Literal["none"]) -> re.Match[str] | None:
+        """Send a text; return its matched reply, see :meth:`ask`, or None without one."""
+        if reply != "none":
+            return self.ask(text, reply)
+        self.send(text)
+        return None
+
     def query(self, text: str, *forms: Reply) -> re.Match[str]:
         """Send a query, see :meth:`ask`; a reply that repeats the query is a MismatchError."""
         return _matched(text, forms, self._question(text, forms[0].example))
@@ -174,11 +181,7 @@ class AsciiSession(SteppedSession):
 
     def set_digital(self, output: AsciiDigitalOutput, high: bool) -> None:
         """Set a digital output."""
-        text = self.text(output.high if high else output.low)
-        if output.reply == "none":
-            self.send(text)
-        else:
-            self.ask(text, output.reply)
+        self.order(self.text(output.high if high else output.low), output.reply)
 
     def is_high(self, source: AsciiDigitalInput) -> bool:
         """Ask whether a digital input is high."""
@@ -274,11 +277,7 @@ class AsciiSession(SteppedSession):
         if isinstance(step, WaitStep):
             self._sleep(step.seconds)
         elif isinstance(step, SendStep):
-            text = self.text(step.text, **values)
-            if step.reply == "none":
-                self.send(text)
-            else:
-                self.ask(text, step.reply)
+            self.order(self.text(step.text, **values), step.reply)
         elif isinstance(step, AskStep):
             self.ask(self.text(step.ask, **values), step)
         else:
@@ -375,8 +374,8 @@ def lines_time(profile: AsciiProfile, lines: Sequence[_Line], settle_s: float = 
     """Return the time of lines with their replies, one after the other."""
     requests, answers = formats(profile.link)
     replies = [reply for _, reply in lines if reply is not None]
-    sent = sum(requests.size(text) for text, _ in lines)
-    received = sum(map(answers.size, replies))
+    sent = sum(len(requests.wire(text)) for text, _ in lines)
+    received = sum(len(answers.wire(reply)) for reply in replies)
     count = sum(lines_of(text) for text, _ in lines)
     what = f"{count} {requests.NAME}{'' if count == 1 else 's'}"
     return profile.wire_time(what, sent, received, len(lines), len(replies), settle_s)

@@ -82,10 +82,6 @@ class LineFormat:
         ends = (f"{each}\r\n".encode() if self.is_whole else self.encode(each) for each in lines)
         return b"".join(ends) + self.encode(last)
 
-    def size(self, text: str) -> int:
-        """Return the bytes of a text of one or more lines."""
-        return len(self.wire(text))
-
     def missing(self, text: str, example: str) -> Missing:
         """Return the number of bytes missing from the reply to ``text``, like ``example``."""
         lines = self._count(text, example)
@@ -154,13 +150,9 @@ class FrameFormat:
         """Return a text of one or more frames as it is sent."""
         return b"".join(map(self.encode, text.split("\n")))
 
-    def size(self, text: str) -> int:
-        """Return the bytes of a text of one or more frames."""
-        return len(self.wire(text))
-
     def missing(self, text: str, example: str) -> Missing:
         """Return the number of bytes missing from a frame as long as ``example``."""
-        size = self.size(example)
+        size = len(self.wire(example))
         return lambda got: max(0, size - len(got))
 
     def split(self, data: Bytes, text: str, example: str) -> list[str]:

@@ -197,12 +197,10 @@ class TextWire(Wire):
 
     def _write(self, value: float) -> bool:
         """Write the output; return whether the reply proves that a device has received it."""
-        text, reply = self._command(value), self.target.reply
-        if reply == "none":
-            self.session.send(text)
-            return False
+        text = self._command(value)
+        found = self.session.order(text, self.target.reply)
         # On a line with echo the reply equals the request.
-        return self.session.ask(text, reply).string != text
+        return found is not None and found.string != text
 
     def _command(self, value: float) -> str:
         return self.session.text(self.target.write, value=self.target.number(value))

@@ -304,7 +304,7 @@ class ModbusSession(SteppedSession):
         value = tick.reader(source)
 
         def read() -> float:
-            tick.run(())
+            tick.run()
             return value()
 
         return read

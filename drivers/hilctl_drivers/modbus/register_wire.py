@@ -232,22 +232,24 @@ class RegisterExchange(JointWire):
         rates, n = self.rates(block), self.requests
         how = f"{n} transaction{'s' * (n > 1)} a sample"
         replace(rates, note=f"{how}; {rates.note}").check(sample_rate_hz)
-        self.tick.read()  # the test of the safe value may have left an error
+        self.tick.run()  # the test of the safe value may have left an error
 
     def _tested(self) -> Tick:
         """Return the tick in one transaction, or else in several.
 
-        The test of one transaction writes the present outputs again.
+        The test of one transaction writes the present outputs again, which must be known.
         """
         session, combined = self._session, self._best
         usual = session.tick(self._planned(combine=False))
-        usual.read()  # a missing address must show before the output moves
+        usual.run()  # a missing address must show before the output moves
         if not combined.combined:
             return usual
-        held = [session.held_data(each.target) for each in self._registers]
+        held = [data for each in self._registers if (data := session.held_data(each.target))]
+        if len(held) < len(self._registers):
+            return usual
         tick = session.tick(combined)
         try:
-            tick.run([each for each in held if each is not None])
+            tick.run(held)
         except NoAnswerError:  # some devices do not answer to an unknown function
             session.link.open()
         except RefusedError:

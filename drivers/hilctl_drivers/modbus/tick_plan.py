@@ -223,19 +223,17 @@ class Tick:
         self._replies = [b""] * len(plan.requests)
         self._steps = [(prepare(each.pdu), _filler(plan, each)) for each in plan.requests]
 
-    def run(self, data: Sequence[bytes]) -> None:
-        """Send the requests with the register bytes of each output, and keep the replies."""
-        replies = self._replies
-        for k, (call, filled) in enumerate(self._steps):
-            replies[k] = call() if filled is None else call(filled(data))
-        if self._check is not None:
-            self._check(replies[-1])
+    def run(self, data: Sequence[bytes] = ()) -> None:
+        """Send the requests with the register bytes of each output, and keep the replies.
 
-    def read(self) -> None:
-        """Send the requests that write nothing, and keep the replies."""
+        Without ``data``, only the requests that write nothing.
+        """
         replies = self._replies
         for k, (call, filled) in enumerate(self._steps):
-            replies[k] = call() if filled is None else b""
+            if filled is None:
+                replies[k] = call()
+            elif data:
+                replies[k] = call(filled(data))
         if self._check is not None:
             self._check(replies[-1])
 

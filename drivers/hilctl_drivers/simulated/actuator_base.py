@@ -122,11 +122,9 @@ class Plant(ABC):
 
     def hold(self, n_samples: int, command: float) -> None:
         """Let ``n_samples`` sample periods pass with the output at ``command``."""
-        unread = np.empty((2, CHUNK))
-        held = np.full(CHUNK, command)
         for start in range(0, n_samples, CHUNK):
-            size = min(CHUNK, n_samples - start)
-            self.step(held[:size], unread[0, :size], unread[1, :size])
+            held = np.full(min(CHUNK, n_samples - start), command)
+            self.step(held, *np.empty((2, held.size)))
 
     @abstractmethod
     def _rest(self) -> None:

@@ -377,7 +377,7 @@ def test_checksums_of_frames(checksum, wire):
     data = bytes.fromhex(wire)
     text = reply.decode(data)
     assert request.encode(text) == data
-    assert request.size(f"{text}\n{text}") == 2 * len(data)
+    assert len(request.wire(f"{text}\n{text}")) == 2 * len(data)
     if reply.check.size:
         with pytest.raises(links.CorruptError):
             reply.decode(b"\1" + data[1:-1] + b"\2")
