@@ -268,29 +268,20 @@ class LabJackWire(RegisterWire):
         self.buffer = StreamSession(
             self.session, streaming, options.reply_timeout_s, profile.turnaround_s
         )
-        self._streamed = StreamExchange([self])
+        self._own = StreamExchange([self])
 
     def joint(self, wires: Sequence[Wire]) -> JointWire:
         """See :meth:`~hilctl_drivers.wire.Wire.joint`."""
         return StreamExchange(cast("Sequence[LabJackWire]", wires))
-
-    def rates(self, block: int) -> RateLimit:
-        """See :meth:`~hilctl_drivers.wire.Wire.rates`."""
-        return self._streamed.rates(block)
 
     def recover(self) -> None:
         """End a trip, and a stream, also one of another program: it accepts no settings."""
         super().recover()
         self.buffer.stop()
 
-    def start(self, reader: SensorReader, sample_rate_hz: float, block: int) -> None:
-        """See :meth:`~hilctl_drivers.wire.Wire.start`."""
-        self._streamed.start([reader], sample_rate_hz, block)
-        self.requests = self._streamed.requests
-
     def exchange(self, first_sample: int, command: F64, displacement_um: F64) -> None:
         """See :meth:`~hilctl_drivers.wire.Wire.exchange`."""
-        self._streamed.exchange(first_sample, (command,), (displacement_um,))
+        self._own.exchange(first_sample, (command,), (displacement_um,))
 
     def take_scans(self, volts: Sequence[F64], displacement_um: F64) -> None:
         """Fill in displacements and aux from float64[B] volts of each of its sources."""

@@ -51,15 +51,17 @@ class RegisterWire(Wire):
         self._factors, self._encode = setup.chain.factors, target.format.encode
         self._position: Callable[[], float]
         self._aux: list[tuple[int, AuxSource, Callable[[], float]]] = []
-        self._own = RegisterExchange([self])
-        setup.check_timeout(self._own.time)
+        own = RegisterExchange([self])
+        setup.check_timeout(own.time)
+        self._own: JointWire = own
+        self._tick: Tick
 
     def joint(self, wires: Sequence[Wire]) -> JointWire:
         """See :meth:`~hilctl_drivers.wire.Wire.joint`."""
         return RegisterExchange(cast("Sequence[RegisterWire]", wires))
 
     def rates(self, block: int) -> RateLimit:
-        """Return the rates with the present number of transactions."""
+        """See :meth:`~hilctl_drivers.wire.Wire.rates`."""
         return self._own.rates(block)
 
     def start(self, reader: SensorReader, sample_rate_hz: float, block: int) -> None:
@@ -72,7 +74,7 @@ class RegisterWire(Wire):
         if self.setup.reads_elsewhere:
             self._own.exchange(first_sample, (command,), (displacement_um,))
         else:  # which takes half the time
-            self._own.tick.run((self.encoded(command),))
+            self._tick.run((self.encoded(command),))
             self.take(None, displacement_um)
 
     def release(self) -> None:
@@ -91,7 +93,7 @@ class RegisterWire(Wire):
 
     def bind(self, tick: Tick) -> None:
         """Take the readings from the replies of a tick."""
-        setup, self.aux_in_turn = self.setup, self.extra_aux(tick.plan)
+        setup, self._tick, self.aux_in_turn = self.setup, tick, self.extra_aux(tick.plan)
         if not setup.reads_elsewhere:
             self._position = tick.reader(cast(ModbusInput, setup.input))
         if setup.measure is not None:
