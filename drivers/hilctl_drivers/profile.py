@@ -16,6 +16,7 @@ from pydantic.json_schema import models_json_schema
 from hilctl.base.errors import ConfigError, ConfigProblem, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
+from hilctl.base.strict import KeySchema
 from hilctl.base.yaml import Document, broken_rules, loc_of, option_file
 from hilctl_drivers.profile_base import BaseProfile
 
@@ -159,7 +160,9 @@ def check_baud(profile: BaseProfile, baud: int) -> None:
 def profile_schema_text() -> str:
     """Return the JSON schema of profiles, as the text of ``profiles/schema.json``."""
     models = list(dict.fromkeys(map(profile_class, LINK_KINDS)))
-    refs, schema = models_json_schema([(model, "validation") for model in models])
+    refs, schema = models_json_schema(
+        [(model, "validation") for model in models], schema_generator=KeySchema
+    )
     whole = {
         "$schema": "https://json-schema.org/draft/2020-12/schema",
         "title": "hilctl device profile",

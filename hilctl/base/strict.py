@@ -19,14 +19,15 @@ from pydantic import (
     field_validator,
     model_validator,
 )
+from pydantic.json_schema import GenerateJsonSchema
 from pydantic_core import ErrorDetails
 from pydantic_core import PydanticKnownError as KnownError
 
 __all__ = [
-    "HALF_CHARACTER", "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "KnownError",
-    "PlainSerializer", "PrivateAttr", "StrictModel", "StringConstraints", "ValidationError",
-    "ValidationInfo", "WithJsonSchema", "field_validator", "first_problem", "model_validator",
-    "without_halves",
+    "HALF_CHARACTER", "AfterValidator", "BeforeValidator", "CheckedModel", "Field", "KeySchema",
+    "KnownError", "PlainSerializer", "PrivateAttr", "StrictModel", "StringConstraints",
+    "ValidationError", "ValidationInfo", "WithJsonSchema", "field_validator", "first_problem",
+    "model_validator", "without_halves",
 ]  # fmt: skip
 
 
@@ -95,6 +96,14 @@ def first_problem(error: ValidationError, whole: str = "message") -> str:
     """Return the place and text of the first problem; ``whole`` names the place of all data."""
     first = error.errors(include_url=False)[0]
     return f"{'.'.join(map(str, first['loc'])) or whole}: {rule_of(first)}"
+
+
+class KeySchema(GenerateJsonSchema):
+    """JSON schema without a title of each key, which repeats its name."""
+
+    def field_title_should_be_set(self, schema: Any) -> bool:
+        """Return whether a key has a title: never."""
+        return False
 
 
 class StrictModel(BaseModel):

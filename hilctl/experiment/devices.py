@@ -23,6 +23,7 @@ from hilctl.base.device import Device, DeviceInfo, VoltageLimit, complete
 from hilctl.base.errors import ConfigError, DeviceError, HilctlError, InputError
 from hilctl.base.files import TextFiles
 from hilctl.base.formatting import did_you_mean
+from hilctl.base.strict import KeySchema
 from hilctl.base.yaml import Document, load_document
 
 BUILTIN: dict[str, str] = {
@@ -72,7 +73,7 @@ def options_schema(kind: str) -> dict[str, Any]:
     """Return the JSON schema of a device's options; raise InputError as :func:`device_class`."""
     options = device_class(kind).Options
     with _named_errors(kind, "cannot describe"):
-        return options.model_json_schema()
+        return options.model_json_schema(schema_generator=KeySchema)
 
 
 @contextmanager

@@ -10,6 +10,7 @@ from hilctl.base.strict import (
     AfterValidator,
     BeforeValidator,
     Field,
+    KeySchema,
     StrictModel,
     WithJsonSchema,
 )
@@ -150,7 +151,7 @@ class Experiment(StrictModel):
 
 def experiment_schema() -> dict[str, Any]:
     """Return the JSON schema of experiment files, including the options of all known devices."""
-    one = Experiment.model_json_schema()
+    one = Experiment.model_json_schema(schema_generator=KeySchema)
     definitions = one.pop("$defs")
     choices = []
     for kind in known_devices():
