@@ -40,7 +40,7 @@ MAX_COLUMNS = 1000
 """Most columns of a table."""
 _LATE = 1.0  # largest departure of a sample from an even grid, in steps
 _IN_BRACKETS = re.compile(r"(?P<name>.*?)\s*[\[(](?P<unit>[^\])]*)[\])]")
-_SUFFIX = re.compile(r".*_(?P<unit>s|ms|us|V|mV|A|mA|um|nm|mm)", re.IGNORECASE)
+_SUFFIX = re.compile(r".*_(?P<unit>s|ms|us|ns|V|mV|kV|A|mA|um|nm|mm)", re.IGNORECASE)
 _SCALES: dict[str, dict[str, float]] = {
     "s": {"s sec second seconds": 1.0, "ms": 1e-3, "us": 1e-6, "ns": 1e-9, "min": 60.0},
     "um": {"um micron microns micrometer": 1.0, "nm": 1e-3, "mm": 1e3, "m": 1e6},

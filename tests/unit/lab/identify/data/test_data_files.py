@@ -265,6 +265,7 @@ def test_columns_are_known_by_their_units(tmp_path):
         ("t,drive,gap", 0.05, 30.0, [{"rate_hz": 20000.0}, {"rate_hz": 20.0}]),
         ("t_s,drive,gap", 0.05, 30.0, []),
         ("t_ms,drive,gap_um", 200.0, 30.0, []),
+        ("t_ns,drive,gap_um", 2e6, 30.0, []),
         ("t,drive,gap", 0.002, 0.03, [{"displacement_scale": 1000.0}, {"displacement_scale": 1.0}]),
         ("t,drive,gap_um", 0.002, 0.03, [{"displacement_scale": 1000.0}]),
         ("t,drive,gap_nm", 0.002, 30.0, []),
