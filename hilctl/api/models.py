@@ -19,7 +19,12 @@ from hilctl.lab.identify.data.data_files import load_records
 from hilctl.lab.identify.fit_api import FitRequest, OnProgress
 from hilctl.lab.identify.model_selection import choose_lag
 from hilctl.lab.identify.parallel import MapFunction, workers
-from hilctl.lab.identify.pipeline import Identification, identify_records, settings_from
+from hilctl.lab.identify.pipeline import (
+    Identification,
+    as_recorded,
+    identify_records,
+    settings_from,
+)
 from hilctl.lab.identify.refinement import Refinement, refine_records
 from hilctl.lab.identify.settings import IdentifySettings
 from hilctl.lab.model_export.model_export import check_rate, export_text
@@ -71,6 +76,9 @@ def identify(
             )
         request, understood = _request(paths, others, chosen, lag, run, on_progress)
         found = identify_records(request)
+    if chosen.table.find_lag:
+        recorded, _ = _request(paths, others, chosen, 0, map, on_progress)
+        found = as_recorded(found, recorded, lag)
     if output is not None and found.verdict.grade != "not a model":
         write_text(Path(output), dump_model(found.fit.model), overwrite=overwrite)
     return replace(found, lag_samples=lag, understood=understood)

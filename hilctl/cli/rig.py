@@ -232,7 +232,7 @@ def print_characterisation(result: Characterisation, model: Path | None, page: P
     """Print the validation error, the measured values and the files."""
     if result.held_out:
         print(f"verdict: {result.verdict}")
-        for note in result.verdict.notes if result.verdict else ():
+        for note in (result.verdict.largest, *result.verdict.notes) if result.verdict else ():
             print(note)
         title = "validation errors (references that were not fitted)"
         print_rich(table(title, HELD_OUT_HEADINGS, held_out_rows(result)))

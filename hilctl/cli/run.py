@@ -338,7 +338,8 @@ def _forecast_rows(checked: CheckedExperiment) -> dict[str, str]:
         rows["voltage"] = f"{forecast.voltage_v:.4g} V (limit {config.amplifier.voltage_max_v:g})"
     if (expected := checked.expected) is not None:
         rows["model error"] = (
-            f"up to {expected.percent:.2g} % of a motion's peak-to-peak at {expected.stroke}"
+            f"{expected.percent:.2g} % of a motion's peak-to-peak at {expected.stroke}, exceeded "
+            "at a tenth of places and frequencies"
         )
     if forecast.begins:
         rows["initial state"] = forecast.begins

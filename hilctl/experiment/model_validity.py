@@ -42,7 +42,7 @@ class Spectrum:
 
 @dataclass(frozen=True, slots=True)
 class ExpectedError:
-    """Largest error of the model that is expected on a reference."""
+    """Peak error of the model that is expected on a reference, see ``errors_by_stroke``."""
 
     stroke: str  # class of its smallest motion, see :data:`hilctl.models.base.STROKES`
     percent: float  # of the peak-to-peak of that motion

@@ -168,8 +168,9 @@ class Provenance(StrictModel):
         grid: The loops used.
         parameters: Fitted parameters by name.
         errors_percent: Model errors, by name, in percent of the peak-to-peak output.
-        errors_by_stroke: Largest expected error of a motion of each class of :data:`STROKES`, in
-            percent of its own peak-to-peak; classes without data are missing.
+        errors_by_stroke: Expected peak error of a motion of each class of :data:`STROKES`, in
+            percent of its own peak-to-peak: what 90 % of places and frequencies do not exceed.
+            Classes without data are missing.
         identified_range: The motions used; None if unknown.
         versions: Software versions, by name.
         created: Date and time in ISO 8601, UTC.

@@ -1,9 +1,10 @@
 """Errors of a model of any kind on records, and on motions of each class of strokes."""
 
 import math
+from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
 from dataclasses import asdict, dataclass
-from itertools import pairwise, starmap
+from itertools import chain, pairwise
 from typing import Any, Literal, NamedTuple
 
 import numpy as np
@@ -36,14 +37,18 @@ class LoopScore:
 class StrokeError:
     """Error of a model on motions of one class of strokes, each in percent of its own peak-to-peak.
 
-    Long records are cut into motions. The peak error of a record is the 95th percentile of its
-    motions, and the error of the class is the largest of all records.
+    Records are cut into motions of a few cycles. The error of a place and a frequency (a third of
+    the stroke and an octave) is the root mean square of those of the motions there. Each place and
+    frequency counts once, however many motions it has.
     """
 
     label: str  # class, see :data:`hilctl.models.base.STROKES`
-    peak_percent: float
-    rms_percent: float
+    peak_percent: float  # 90 % quantile over places and frequencies
+    rms_percent: float  # the same of root mean squares
     motions: int
+    median_percent: float = math.nan  # median over places and frequencies
+    worst_percent: float = math.nan  # peak error of the worst motion
+    worst: str = ""  # that motion: record, frequency and middle
 
 
 @dataclass(frozen=True, kw_only=True)
@@ -55,7 +60,7 @@ class Evaluation:
     peak_percent: float  # largest error, of the largest peak-to-peak of a record
     rms_percent: float  # root mean square displacement error, in percent of the same
     own_peak_percent: float  # largest ``peak_percent`` of single records
-    classes: tuple[StrokeError, ...]  # of the classes that have motions, the largest first
+    classes: tuple[StrokeError, ...]  # of the model as it is written, the largest strokes first
 
     @property
     def stroke_percent(self) -> float:
@@ -81,25 +86,46 @@ def judge(
     creep: bool = False,
     stroke_um: float | None = None,  # that classes refer to; the largest of the records if None
 ) -> Evaluation:
-    """Return the errors of a model on records; loops are in their periodic steady state."""
+    """Return the errors of a model on records; loops are in their periodic steady state.
+
+    With ``creep`` the errors of records are those without the offset and creep of each record. The
+    model has neither, so they remain in the errors of motions.
+    """
     data = data if isinstance(data, FitData) else FitData(data)
+    return judgement_of(data, responses_um(model, data), stroke_um, creep=creep)
+
+
+def responses_um(model: HysteresisModel, data: FitData) -> F64:
+    """Return the displacement of a model at the evaluated samples of all records: float64[N]."""
     if isinstance(model, PlayModel):
-        responses_um = data.response_um(model)
-    else:
-        parts = parallel_map(lambda each: _record_um(model, each), data.records)
-        responses_um = np.concatenate(parts)
-    if creep:
-        responses_um = data.with_creep(responses_um)
-    return judgement_of(data, responses_um, stroke_um)
+        return data.response_um(model)
+    return np.concatenate(parallel_map(lambda each: _record_um(model, each), data.records))
 
 
-def judgement_of(data: FitData, responses_um: F64, stroke_um: float | None = None) -> Evaluation:
+def judgement_of(
+    data: FitData, responses_um: F64, stroke_um: float | None = None, *, creep: bool = False
+) -> Evaluation:
     """Return the errors of responses, float64[N], at the evaluated samples of the records."""
+    stroke_um = stroke_um or data.stroke_um
     responses_um = np.where(data.evaluated, responses_um, data.target_um)
+    targets_um = [data.target_um[place] for place in data.places]
+    motions = [
+        motion
+        for record, place, target_um in zip(data.records, data.places, targets_um, strict=True)
+        for motion in motions_of(
+            record.label,
+            target_um,
+            responses_um[place],
+            _rate_hz(record),
+            stroke_um,
+            record.command[-target_um.size :] if isinstance(record, History) else None,
+        )
+    ]
+    if creep:
+        responses_um = np.where(data.evaluated, data.with_creep(responses_um), data.target_um)
     errors_um = responses_um - data.target_um
     modelled_um = tuple(responses_um[place] for place in data.places)
-    targets_um = [data.target_um[place] for place in data.places]
-    parts = list(zip(data.records, modelled_um, targets_um, strict=True))
+    parts = zip(data.records, modelled_um, targets_um, strict=True)
     errors = tuple(_loop_error(*part) for part in parts)
     to_percent = 100.0 / data.stroke_um
     return Evaluation(
@@ -108,21 +134,15 @@ def judgement_of(data: FitData, responses_um: F64, stroke_um: float | None = Non
         peak_percent=float(np.max(np.abs(errors_um))) * to_percent,
         rms_percent=float(np.sqrt(np.mean(errors_um**2))) * to_percent,
         own_peak_percent=max(error.peak_percent for error in errors),
-        classes=stroke_errors(
-            motions_of(
-                target_um,
-                response_um,
-                stroke_um or data.stroke_um,
-                record.command[-target_um.size :] if isinstance(record, History) else None,
-            )
-            for record, response_um, target_um in parts
-        ),
+        classes=stroke_errors(motions, stroke_um),
     )
 
 
-MOST_MOTIONS_PERCENT = 95.0
+QUANTILE = 90.0  # percent
 TINY_PERCENT = 1e-9  # an error that is 0 has no logarithm
-FEWEST_SWINGS = 2
+FEWEST_SWINGS, MOST_SWINGS = 2, 8  # of a motion
+PLACES = 3  # of the stroke
+AVERAGED = 25  # parts of a cycle that an error is averaged over, against noise
 _LIMITS = (math.inf, *(math.sqrt(a * b) for a, b in pairwise(STROKES.values())))
 """Largest motion of each class, of the stroke."""
 
@@ -130,38 +150,54 @@ _LIMITS = (math.inf, *(math.sqrt(a * b) for a, b in pairwise(STROKES.values())))
 class MotionError(NamedTuple):
     """Errors of a motion in percent of its peak-to-peak."""
 
-    label: str  # class of its stroke
+    stroke: str  # its class
     peak_percent: float
     rms_percent: float
+    middle_um: float
+    frequency_hz: float
+    record: str
 
 
 def motions_of(
+    label: str,
     measured_um: F64,
     modelled_um: F64,
+    rate_hz: float,
     stroke_um: float,
     command: F64 | None = None,  # of a history; a loop is one motion
 ) -> list[MotionError]:
     """Return the motions of all classes in a record; the whole record if it has no two swings."""
-    places = set[tuple[int, int]]()
-    if command is not None:
+    places = dict[tuple[int, int], int]()
+    error_um = modelled_um - measured_um
+    if command is None:
+        error_um = np.append(error_um, error_um[: measured_um.size // AVERAGED])
+    else:
         turns = np.unique([0, *turning_points(command), command.size])
-        places = set(_cut(measured_um, turns, stroke_um))
+        places = dict(_cut(measured_um, turns, stroke_um))
+    whole = {(0, measured_um.size): FEWEST_SWINGS}
+    sums = np.concatenate(([0.0], np.cumsum(error_um)))
     found = []
-    for place in starmap(slice, sorted(places or {(0, measured_um.size)})):
-        error_um = modelled_um[place] - measured_um[place]
-        span_um = float(np.ptp(measured_um[place]))
-        label = stroke_class(span_um / stroke_um)
-        if places and STROKES[label] < 1.0:
+    for (start, stop), swings in sorted((places or whole).items()):
+        frequency_hz = 0.5 * swings * rate_hz / (stop - start)
+        window = max(int(rate_hz / frequency_hz / AVERAGED), 1)
+        ends = sums[start : stop + 1 if places else None]
+        averaged_um = (ends[window:] - ends[:-window]) / window
+        low_um, high_um = measured_um[start:stop].min(), measured_um[start:stop].max()
+        span_um = float(high_um - low_um)
+        stroke = stroke_class(span_um / stroke_um)
+        if places and STROKES[stroke] < 1.0:
             # Parts of histories are as large as their class allows, but represent all of it.
-            span_um = min(span_um, STROKES[label] * stroke_um)
-        to_percent = 100.0 / span_um
-        errors_um = cycle_metrics.peak(error_um), cycle_metrics.rms(error_um)
-        found.append(MotionError(label, *(to_percent * each for each in errors_um)))
+            span_um = min(span_um, STROKES[stroke] * stroke_um)
+        peak, rms = (
+            100.0 * of(averaged_um) / span_um for of in (cycle_metrics.peak, cycle_metrics.rms)
+        )
+        middle_um = 0.5 * float(low_um + high_um)
+        found.append(MotionError(stroke, peak, rms, middle_um, frequency_hz, label))
     return found
 
 
-def _cut(measured_um: F64, turns: I64, stroke_um: float) -> Iterator[tuple[int, int]]:
-    """Yield parts from turn to turn, for each class as long as its largest motion allows."""
+def _cut(measured_um: F64, turns: I64, stroke_um: float) -> Iterator[tuple[tuple[int, int], int]]:
+    """Yield parts from turn to turn with their swings, as large as each class allows."""
     lows = np.minimum.reduceat(measured_um, turns[:-1]).tolist()
     highs = np.maximum.reduceat(measured_um, turns[:-1]).tolist()
     swings = [*zip(lows, highs, strict=True), (-math.inf, math.inf)]
@@ -169,39 +205,54 @@ def _cut(measured_um: F64, turns: I64, stroke_um: float) -> Iterator[tuple[int, 
     for most in _LIMITS:
         start, low, high = 0, math.inf, -math.inf
         for swing, (lowest, highest) in enumerate(swings):
-            if swing > start and max(high, highest) - min(low, lowest) >= most * stroke_um:
-                if swing - start >= FEWEST_SWINGS and high - low > least_um:
-                    yield int(turns[start]), int(turns[swing])
+            count = swing - start
+            larger = max(high, highest) - min(low, lowest) >= most * stroke_um
+            if count and (larger or count == MOST_SWINGS or swing == len(swings) - 1):
+                if count >= FEWEST_SWINGS and high - low > least_um:
+                    yield (int(turns[start]), int(turns[swing])), count
                 start, low, high = swing, math.inf, -math.inf
             low, high = min(low, lowest), max(high, highest)
 
 
-def stroke_errors(records: Iterable[Sequence[MotionError]]) -> tuple[StrokeError, ...]:
+def stroke_errors(motions: Iterable[MotionError], stroke_um: float) -> tuple[StrokeError, ...]:
     """Return the error of each class that has motions, see :class:`StrokeError`."""
-    by_class: dict[str, list[F64]] = {name: [] for name in STROKES}
-    for motions in records:
-        for name, found in by_class.items():
-            if own := [each[1:] for each in motions if each.label == name]:
-                found.append(np.array(own))
-    return tuple(
-        StrokeError(
-            label=name,
-            peak_percent=max(
-                float(np.percentile(own[:, 0], MOST_MOTIONS_PERCENT, method="higher"))
-                for own in found
-            ),
-            rms_percent=max(cycle_metrics.rms(own[:, 1]) for own in found),
-            motions=sum(map(len, found)),
-        )
-        for name, found in by_class.items()
-        if found
+    by_class: dict[str, list[MotionError]] = {name: [] for name in STROKES}
+    for each in motions:
+        by_class[each.stroke].append(each)
+    return tuple(_stroke_error(name, found, stroke_um) for name, found in by_class.items() if found)
+
+
+def _stroke_error(name: str, motions: Sequence[MotionError], stroke_um: float) -> StrokeError:
+    cells = defaultdict[tuple[int, int], list[tuple[float, float]]](list)
+    for each in motions:
+        place, octave = PLACES * each.middle_um / stroke_um, math.log2(each.frequency_hz)
+        cells[round(place), round(octave)].append((each.peak_percent, each.rms_percent))
+    errors = np.array([np.sqrt(np.mean(np.square(there), axis=0)) for there in cells.values()])
+    peak, rms = np.percentile(errors, QUANTILE, axis=0).tolist()
+    worst = max(motions, key=lambda each: each.peak_percent)
+    return StrokeError(
+        label=name,
+        peak_percent=peak,
+        rms_percent=rms,
+        motions=len(motions),
+        median_percent=float(np.median(errors, axis=0)[0]),
+        worst_percent=worst.peak_percent,
+        worst=f"'{worst.record}' at {worst.frequency_hz:.3g} Hz about {worst.middle_um:.3g} µm",
     )
 
 
-def largest_errors(errors: Sequence[StrokeError]) -> tuple[StrokeError, ...]:
+def largest_errors(*sources: Sequence[StrokeError]) -> tuple[StrokeError, ...]:
     """Return the largest error of each class."""
-    found = {each.label: each for each in sorted(errors, key=lambda each: each.peak_percent)}
+    errors = sorted(chain(*sources), key=lambda each: each.peak_percent)
+    found = {each.label: each for each in errors}
     return tuple(found[name] for name in STROKES if name in found)
+
+
+def _rate_hz(record: Record) -> float:
+    """Return the points per second of a loop, or the sample rate of a history."""
+    if isinstance(record, SteadyLoop):
+        return record.command.size * record.frequency_hz
+    return record.sample_rate_hz
 
 
 def _record_um(model: HysteresisModel, record: Record) -> F64:
@@ -211,9 +262,8 @@ def _record_um(model: HysteresisModel, record: Record) -> F64:
         return model.forward(record.sample_rate_hz).process(command)[ignored:]
     if record.sample_rate_hz > 0.0 and isinstance(model, StagedModel):
         return _sampled_cycle_um(model, record)
-    points, rate_hz = record.command.size, record.command.size * record.frequency_hz
     periods = np.tile(record.command, PERIODS)
-    return model.forward(rate_hz).process(periods)[-points:]
+    return model.forward(_rate_hz(record)).process(periods)[-record.command.size :]
 
 
 def _sampled_cycle_um(model: HysteresisModel, loop: SteadyLoop) -> F64:

@@ -4,7 +4,7 @@ A kind is chosen by the geometric mean of its errors by stroke. Large motions do
 of whole histories, which hides a kind whose small loops are several times worse.
 """
 
-from collections.abc import Callable, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from dataclasses import dataclass, replace
 from itertools import zip_longest
 from typing import Any
@@ -13,8 +13,8 @@ import numpy as np
 
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64
-from hilctl.lab.identify.data.records import History, Record, Records, SteadyLoop
-from hilctl.lab.identify.evaluation import Evaluation, judge, judgement_of
+from hilctl.lab.identify.data.records import History, Record, Records, SteadyLoop, turning_points
+from hilctl.lab.identify.evaluation import Evaluation, judgement_of, responses_um
 from hilctl.lab.identify.fit_api import FitRequest, OnProgress, ignore_progress
 from hilctl.lab.identify.fit_data import FitData
 from hilctl.lab.identify.fit_model import creeps, fit_kind, fit_model
@@ -118,8 +118,7 @@ def _fitted(task: tuple[int, Split, FitRequest]) -> tuple[F64, object | None] | 
         found = fit_kind(request)
     except DataError:  # too few records for this kind of fit; all of them may be enough
         return None
-    judged = judge(found.model, fold.held_out, creep=request.settings.creep)
-    return np.concatenate(judged.modelled_um), found.end
+    return responses_um(found.model, FitData(fold.held_out)), found.end
 
 
 def _together(
@@ -128,11 +127,12 @@ def _together(
     if not done:
         return None
     held_out = tuple(record for fold, _, _ in done for record in fold.held_out)
-    responses_um = np.concatenate([modelled for _, modelled, _ in done])
+    modelled_um = np.concatenate([each for _, each, _ in done])
     parts = "histories (or their last parts)" if isinstance(held_out[-1], History) else "loops"
     how = f"{len(held_out)} of {len(request.records)} {parts}, held out in turn"
     stroke_um = FitData(request.records).stroke_um
-    judgement = judgement_of(FitData(held_out, request.unit), responses_um, stroke_um)
+    data, creep = FitData(held_out, request.unit), request.settings.creep
+    judgement = judgement_of(data, modelled_um, stroke_um, creep=creep)
     return HeldOut(judgement, held_out, how, done[-1][2])
 
 
@@ -169,6 +169,40 @@ def _extremes(record: Record) -> F64:
     return np.array([command.max(), -command.min(), frequency_hz, -frequency_hz, speed])
 
 
+ALIKE = 1.2  # ratio of amplitudes or frequencies that count as one
+
+
+def alike_loops(records: Sequence[Record]) -> Iterator[str]:
+    """Yield notes on loops of one frequency or amplitude (80 % of them)."""
+    frequencies_hz, sizes = map(np.concatenate, zip(*map(_swings, records), strict=True))
+    low, high = np.percentile((frequencies_hz, sizes), (10.0, 90.0), axis=1, method="nearest")
+    if high[0] < ALIKE * low[0]:
+        yield (
+            f"all loops are at {np.median(frequencies_hz):.3g} Hz, so the influence of the rate is "
+            "unknown: add loops at other frequencies"
+        )
+    if high[1] < ALIKE * low[1]:
+        yield (
+            "all loops have one amplitude, so smaller loops are unknown: add loops at other "
+            "amplitudes"
+        )
+
+
+def _swings(record: Record) -> tuple[F64, F64]:
+    """Return frequency and size of the swings of a command, from turn to turn: float64[n] each."""
+    command = record.command
+    if isinstance(record, SteadyLoop):
+        return np.array([record.frequency_hz]), np.array([np.ptp(command)])
+    turns = turning_points(command)
+    times, moves = np.diff(turns), np.abs(np.diff(command[turns]))
+    inner = slice(1, -1) if times.size > 2 else slice(None)  # the first and the last are cut
+    return 0.5 * record.sample_rate_hz / times[inner], moves[inner]
+
+
+PLAIN: Mapping[str, Any] = {
+    "kind": "ppi", "plays": 25, "weights": "free", "layout": "midpoint", "offset": True,
+}  # fmt: skip
+"""The simplest candidate for all data: plays alone, fitted by linear least squares."""
 WHOLE: tuple[Mapping[str, Any], ...] = (
     {"kind": "field", "plays": 8, "cells": 12, "knots": 16},
     {"kind": "generalised_duhem", "cells": 12, "across": 8},
@@ -176,14 +210,17 @@ WHOLE: tuple[Mapping[str, Any], ...] = (
 """Candidates for histories: a small model of each kind, which is identified quickly."""
 CREEPING: Mapping[str, Any] = {**WHOLE[0], "activation": True}
 """Further candidate for histories whose rests show creep."""
-PLAIN: Mapping[str, Any] = {"kind": "integrated", "offset": True}
+RIGID: Mapping[str, Any] = {**WHOLE[0], "structure": False, "modes": False}
+"""Further candidate for histories of one amplitude or frequency, if no structure was measured."""
+INTEGRATED: Mapping[str, Any] = {"kind": "integrated", "offset": True}
 """Further candidate for histories if the error of all others is large."""
 WELL_PERCENT = 0.6  # mean error by stroke that small models of the right kind reach
 IN_FULL = {"field", "generalised_duhem"}
 """Kinds with a larger candidate, of their default size, if their small model has a small error."""
 NEAR = 2.0  # largest error of a small model of the best kind, over the least error
-WORTH = 0.95  # a larger model must have at most this share of the error, since it slows every run
-LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, {"kind": "integrated", "offset": True})
+WORTH = 0.95  # of the error of a simpler model: the largest one of a model with more parts
+CLEAR = 0.5  # the same on data of one amplitude or frequency, which show no other motions
+LOOPS: tuple[Mapping[str, Any], ...] = ({"kind": "staged"}, INTEGRATED)
 """Candidates for steady loops."""
 MOST_LAG = 8  # samples tried
 
@@ -219,26 +256,34 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
     """Return the kind with the least error."""
     # Small models select the kinds to try at full size: a wrong kind is far off at any size.
     whole = any(isinstance(record, History) for record in request.records)
-    creeping = given.creep_stage and creeps(request.records)
-    histories = (*WHOLE, CREEPING) if creeping else WHOLE
-    errors = _candidates(request, given, histories if whole else LOOPS)
+    candidates = [PLAIN, *(WHOLE if whole else LOOPS)]
+    alike = any(alike_loops(request.records))
+    if whole and alike and given.structure and request.structure is None:
+        candidates.insert(1, RIGID)
+    if whole and given.creep_stage and creeps(request.records):
+        candidates.append(CREEPING)
+    errors = _candidates(request, given, candidates)
     if whole and not any(each.stroke_percent < WELL_PERCENT for each in errors):
-        errors += _candidates(request, given, (PLAIN,))
+        errors += _candidates(request, given, (INTEGRATED,))
     if not errors:
         raise DataError(f"too few data to select a kind of model: {_undivided(request.records)}")
-    best = min(errors, key=lambda tried: tried.stroke_percent)
-    near = [
-        each
-        for each in errors
-        if each.settings.kind in IN_FULL and each.stroke_percent <= NEAR * best.stroke_percent
-    ]
+    worth = CLEAR if alike else WORTH
+    best = _simplest(errors, worth)
+    most = NEAR * min(each.stroke_percent for each in errors)
+    near = [x for x in errors if x.settings.kind in IN_FULL and x.stroke_percent <= most]
     if near:
-        larger = [{"kind": each.settings.kind} | _activation(each) for each in near]
+        larger = [_in_full(each) for each in near]
         found = _candidates(request, given, larger, [each.held_out.end for each in near])
         errors += found
-        better = [x for x in found if x.stroke_percent < WORTH * best.stroke_percent]
-        best = min(better, key=lambda tried: tried.stroke_percent, default=best)
+        worth = WORTH if best in near else worth
+        best = _simplest([best, *sorted(found, key=lambda tried: tried.stroke_percent)], worth)
     return Selection(best.settings, best.held_out, candidates=tuple(e.candidate for e in errors))
+
+
+def _simplest(errors: "Sequence[_Tried]", worth: float) -> "_Tried":
+    """Return the first, simplest one that none of the others is worth more than."""
+    least = min(each.stroke_percent for each in errors)
+    return next(each for each in errors if worth * each.stroke_percent <= least)
 
 
 def _undivided(records: Sequence[Record]) -> str:
@@ -256,10 +301,16 @@ def _undivided(records: Sequence[Record]) -> str:
     )
 
 
-def _activation(tried: "_Tried") -> dict[str, Any]:
-    """Return the settings of plays that creep, for a larger model of the same kind."""
-    # Each of them costs as much per sample as eight that do not.
-    return {"activation": True, "plays": 16} if tried.settings.looks_for("activation") else {}
+def _in_full(tried: "_Tried") -> dict[str, Any]:
+    """Return the settings of a model of the same kind and parts in its default size."""
+    settings = tried.settings
+    chosen: dict[str, Any] = {"kind": settings.kind}
+    if settings.looks_for("activation"):
+        # Each of the plays that creep costs as much per sample as eight that do not.
+        chosen |= {"activation": True, "plays": 16}
+    if not settings.looks_for("structure"):
+        chosen |= {"structure": False, "modes": False}
+    return chosen
 
 
 @dataclass(frozen=True, slots=True)
@@ -306,8 +357,8 @@ def _candidates(
     settings = [IdentifySettings(**each, **shared) for each in candidates]
     parts = {name: getattr(given, name) for name in ("creep_stage", "modes", "structure")}
     settings = [
-        each.model_copy(update={name: on for name, on in parts.items() if each.has(name)})
-        for each in settings
+        each.model_copy(update={k: on for k, on in parts.items() if each.has(k) and k not in own})
+        for each, own in zip(settings, candidates, strict=True)
     ]
     return _tried(request, list(zip(names, settings, strict=True)), starts)
 

@@ -8,11 +8,11 @@ from typing import Any
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.yaml import Document
 from hilctl.lab.identify.data.records import History, Record
-from hilctl.lab.identify.evaluation import judge
+from hilctl.lab.identify.evaluation import judge, largest_errors
 from hilctl.lab.identify.fit_api import FitRequest
 from hilctl.lab.identify.fit_data import FitData
 from hilctl.lab.identify.fit_model import FittedModel, error_table, fit_model
-from hilctl.lab.identify.model_quality import Verdict, verdict_of
+from hilctl.lab.identify.model_quality import Verdict, verdict_of, verdict_on
 from hilctl.lab.identify.model_selection import (
     CandidateScore,
     HeldOut,
@@ -130,7 +130,7 @@ def identify_records(request: FitRequest) -> Identification:
             held_out = held_out_error(chosen)
         return ModalFit(fit, held_out, selection)
 
-    best = with_modes(records, found)
+    best, cost = _at_bound(request, with_modes(records, found))
     fit, held_out, selection = best.fit, best.held_out, best.selection
     if validate:
         stroke_um = FitData(records).stroke_um
@@ -144,9 +144,62 @@ def identify_records(request: FitRequest) -> Identification:
         figures = {f"held_out_{k}": v for k, v in error_table(held_out.judgement).items()}
         update["errors_percent"] = {**fit.model.provenance.errors_percent, **figures}
     fit = _with_provenance(fit, update)
-    verdict = verdict_of(fit, records, selection.settings, held_out)
+
+    def refit(others: Sequence[Record]) -> tuple[float, float] | None:
+        again = held_out_error(replace(request, records=others, settings=selection.settings))
+        if again is None or best.held_out is None:
+            return None
+        return best.held_out.judgement.rms_percent, again.judgement.rms_percent
+
+    verdict = verdict_of(fit, records, selection.settings, held_out, refit)
+    verdict = replace(verdict, notes=(*verdict.notes, *cost))
     identification = Identification(fit, records, verdict, held_out, 0, selection.candidates)
     return with_verdict(identification, verdict)
+
+
+STRUCTURE = {"natural_hz", "damping_ratio"}
+"""Parameters of a structure."""
+
+
+def _at_bound(request: FitRequest, best: ModalFit) -> tuple[ModalFit, tuple[str, ...]]:
+    """Return a fit without its structure if that is at a bound and worth nothing, or its worth."""
+    selection, held_out = best.selection, best.held_out
+    fitted = selection.settings.looks_for("structure")
+    bound = [name for name in best.fit.at_bound if fitted and name in STRUCTURE]
+    if not bound or held_out is None or request.structure is not None:
+        return best, ()
+    parts = {"structure": False, "modes": False}
+    settings = selection.settings.model_copy(update=parts)
+    rigid = replace(request, settings=settings, modes=())
+    other = held_out_error(rigid)
+    if other is None:
+        return best, ()
+    now, without = (each.judgement.stroke_percent for each in (held_out, other))
+    if now < WORTH * without:
+        names = " and ".join(bound)
+        text = f"{names} at a bound: the mean error by stroke is {now:.2g} %, and {without:.2g} %"
+        return best, (f"{text} without the structure",)
+    selection = replace(selection, settings=settings, held_out=other)
+    return ModalFit(fit_model(replace(rigid, start=other.end)), other, selection), ()
+
+
+def as_recorded(found: Identification, request: FitRequest, lag_samples: int) -> Identification:
+    """Return an identification with the verdict on records whose lag was not taken out.
+
+    The model has no lag. If the lag is of the recording, it is set by the user.
+    """
+    if found.verdict.grade == "not a model" or not lag_samples:
+        return found
+    stroke_um, model = FitData(request.records).stroke_um, found.fit.model
+    parts = [each for each in (request.records, request.validate) if each]
+    classes = largest_errors(*(judge(model, each, stroke_um=stroke_um).classes for each in parts))
+    note = (
+        f"the model has no lag, and the displacement lags by {lag_samples} samples: if the "
+        f"recording delays it, set table.lag_samples={lag_samples}; otherwise use --model staged"
+    )
+    known, held_out = found.verdict.grade == "good", found.verdict.held_out
+    notes = (note, *found.verdict.notes)
+    return with_verdict(found, verdict_on(classes, known=known, held_out=held_out, notes=notes))
 
 
 def with_verdict(found: Identification, verdict: Verdict) -> Identification:

@@ -42,7 +42,8 @@ def _mark(fit: FittedModel, name: str) -> str:
 
 def summary(found: Identification) -> list[str]:
     """Return the result in a few lines, the grade first."""
-    return [str(found.verdict), *found.verdict.notes, *details(found)]
+    verdict = found.verdict
+    return [str(verdict), verdict.largest, *verdict.notes, *details(found)]
 
 
 def details(found: Identification) -> list[str]:
@@ -111,12 +112,16 @@ def stroke_table(verdict: Verdict) -> Table:
     """Return the errors of each class of motions, the promised one and its grade first."""
     # Small errors are only usable if the data do not cover other motions.
     covered = verdict.held_out and verdict.grade in {"poor", grade_of(verdict.classes)}
-    return ("stroke", "promised %", "grade", "rms %", "motions"), [
+    headings = "promised %", "grade", "median %", "rms %", "motions", "worst %", "worst motion"
+    return ("stroke", *headings), [
         (
             *_row(each.label, each.peak_percent),
             grade_of([each], known=covered),
+            f"{each.median_percent:.3g}",
             f"{each.rms_percent:.3g}",
             f"{each.motions}",
+            f"{each.worst_percent:.3g}",
+            each.worst,
         )
         for each in verdict.classes
     ]

@@ -209,18 +209,35 @@ class _SegmentMean:
             )
         self._segment, self._rate_hz = segment, recording.sample_rate_hz
         self._mean = CycleMean(where, segment.period, points, 2)
+        # Sums and numbers of samples in the first and the last half of the cycles.
+        self._half = cycles // 2 * segment.period
+        self._halves = np.zeros((2, 2))
 
     def add(self, piece: Recording) -> None:
         samples = piece.samples.part(self._start, self._stop)
         good = np.isfinite(samples.displacement_um)
-        phase = (samples.index[good] - self._start) / self._segment.period
-        self._mean.add(phase, np.stack([samples.command[good], samples.displacement_um[good]]))
+        at = samples.index[good] - self._start
+        phase = at / self._segment.period
+        displacement_um = samples.displacement_um[good]
+        self._mean.add(phase, np.stack([samples.command[good], displacement_um]))
+        length = self._stop - self._start
+        for half, inside in enumerate((at < self._half, at >= length - self._half)):
+            self._halves[half] += displacement_um[inside].sum(), np.count_nonzero(inside)
 
     def loop(self) -> SteadyLoop:
         frequency_hz = self._rate_hz / self._segment.period
         command, displacement_um = self._mean.cycle()
+        sums_um, counts = self._halves.T
+        apart_s = (self._stop - self._start - self._half) / self._rate_hz
+        drift_um_per_s = np.diff(sums_um / counts).item() / apart_s if counts.all() else 0.0
         return SteadyLoop(
-            self._segment.label, command, displacement_um, frequency_hz, self._rate_hz
+            self._segment.label,
+            command,
+            displacement_um,
+            frequency_hz,
+            self._rate_hz,
+            self._start / self._rate_hz,
+            drift_um_per_s,
         )
 
 

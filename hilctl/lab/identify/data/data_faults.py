@@ -282,7 +282,7 @@ def _without(record: Record, start: int, stop: int) -> str:
 
 def _far_from_zero(record: Record, settings: FitSettings) -> str:
     """Return a message if the displacement has an offset that the model lacks."""
-    if settings.fit.has_offset:
+    if settings.fit.has_offset or settings.looks_for("offset") or settings.creep:
         return ""
     middle_um = 0.5 * float(record.displacement_um.max() + record.displacement_um.min())
     if abs(middle_um) < float(np.ptp(record.displacement_um)):

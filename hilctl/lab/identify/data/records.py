@@ -27,6 +27,8 @@ class SteadyLoop:
     displacement_um: F64  # float64[M]
     frequency_hz: float
     sample_rate_hz: float = 0.0  # sample rate of the run that it was averaged from; 0.0 if unknown
+    start_s: float = 0.0  # time of the first averaged cycle in the run
+    drift_um_per_s: float = 0.0  # from the first half of the cycles to the second one
 
     def __post_init__(self) -> None:
         check_signals(self.label, self.command, self.displacement_um)

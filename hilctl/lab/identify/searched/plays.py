@@ -41,9 +41,16 @@ class SearchSpace:
         return cls(tuple(variables), *np.array(list(variables.values())).T.copy())
 
     def at_bound(self, x: F64) -> tuple[str, ...]:
-        """Return the names of the variables of a point, float64[p], that are at a bound."""
+        """Return the names of the variables of a point, float64[p], that are at a bound.
+
+        A part of 0 is absent, and beyond its upper bound a spacing (the first variable) has plays
+        that do not move: these bounds do not count.
+        """
         near = HELD * (self.high - self.low)
-        held = (x <= self.low + near) | (x >= self.high - near)
+        low = (x <= self.low + near) & (self.low != 0.0)
+        high = x >= self.high - near
+        high[0] = False
+        held = low | high
         return tuple(name for name, bound in zip(self.names, held, strict=True) if bound)
 
     def draw(self, rng: np.random.Generator) -> F64:

@@ -1,7 +1,8 @@
 """Results of a characterisation: measurements, model, and validation."""
 
 from collections.abc import Iterable, Mapping
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from itertools import chain
 from pathlib import Path
 from typing import Any
 
@@ -15,7 +16,7 @@ from hilctl.lab.identify.data.records import History
 from hilctl.lab.identify.evaluation import MotionError, largest_errors, motions_of, stroke_errors
 from hilctl.lab.identify.fit_api import FitRequest
 from hilctl.lab.identify.fit_data import FitData
-from hilctl.lab.identify.model_quality import MOST_PERCENT, Verdict, grade_of
+from hilctl.lab.identify.model_quality import MOST_PERCENT, Verdict, verdict_on
 from hilctl.lab.identify.parallel import parallel_map, workers
 from hilctl.lab.identify.pipeline import (
     Identification,
@@ -31,7 +32,7 @@ from hilctl.lab.studies.characterise.measurements import (
     ReversalCurves,
     StepResponseCheck,
 )
-from hilctl.models.base import STROKES, HysteresisModel
+from hilctl.models.base import HysteresisModel
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
@@ -69,13 +70,16 @@ class ValidationReference:
 
     def motions(self, stroke_um: float) -> list[MotionError]:
         """Return its motions, see :func:`hilctl.lab.identify.evaluation.motions_of`."""
-        gaps = np.flatnonzero(np.diff(self.time_s) > 1.5 * np.ptp(self.time_s[:2])) + 1
+        step_s = float(np.ptp(self.time_s[:2]))
+        gaps = np.flatnonzero(np.diff(self.time_s) > 1.5 * step_s) + 1
         signals = (self.measured_um, self.modelled_um, self.command)
         parts = zip(*(np.split(signal, gaps) for signal in signals), strict=True)
         return [
             motion
             for measured_um, modelled_um, command in parts
-            for motion in motions_of(measured_um, modelled_um, stroke_um, command)
+            for motion in motions_of(
+                self.label, measured_um, modelled_um, 1.0 / step_s, stroke_um, command
+            )
         ]
 
 
@@ -160,7 +164,6 @@ def _without_signals(values: Iterable[tuple[str, Any]]) -> dict[str, Any]:
 
 
 _SLACK = 0.01
-_NOISE_PEAK = 3.0  # largest noise in a motion, over its rms
 
 FITTED = ("slow-loops", "fast-loops", "creep", "small-motions", "settled-loops", "training")
 """Steps for identification. Each starts with a motion of full amplitude, which erases the earlier
@@ -231,16 +234,10 @@ def validated(
         verdict = Verdict("not a model", peak, held_out=True, reasons=(reason,))
     else:
         stroke_um = FitData(found.data).stroke_um
-        more = stroke_errors(reference.motions(stroke_um) for reference in references)
-        classes = largest_errors((*known.classes, *more))
-        within = max(each.peak_percent for each in classes)
-        # The grade concerns the model, so it excludes the sensor's noise.
-        noise_percent = 100.0 * _NOISE_PEAK * noise_um / stroke_um
-        models = [
-            replace(each, peak_percent=each.peak_percent - noise_percent / STROKES[each.label])
-            for each in classes
-        ]
-        verdict = Verdict(grade_of(models), within, True, notes=known.notes, classes=classes)
+        apart = stroke_errors(chain(*(each.motions(stroke_um) for each in references)), stroke_um)
+        # The parts that selected the kind of model are few, and the references replace them.
+        classes = largest_errors(found.fit.classes, apart)
+        verdict = verdict_on(classes, notes=known.notes)
     return with_verdict(found, verdict), references
 
 

@@ -26,7 +26,9 @@ def page_of(data_of):
         records = data_of(TRUTH).records
         fit = fit_model(FitRequest(records, FitSettings(kind="straight"), source=["<a & b>.csv"]))
         unseen = HeldOut(judge(fit.model, held_out), held_out, "others") if held_out else None
-        verdict = verdict_of(fit, records, FitSettings(kind="straight"), unseen)
+        verdict = verdict_of(
+            fit, records, FitSettings(kind="straight"), unseen, lambda records: None
+        )
         return identification_page(Identification(fit, records, verdict, unseen, 0))
 
     return make

@@ -63,9 +63,9 @@ def test_what_was_not_fitted_comes_before_what_was():
     judgement = SimpleNamespace(peak_percent=3.0, rms_percent=1.0, own_peak_percent=5.0)
     lines = summary(found(SimpleNamespace(judgement=judgement, how="others"), lag_samples=2))
     assert lines[0].startswith("usable within 4 % at full stroke")
-    assert lines[1] == "one note"
-    assert lines[2].startswith("not fitted: peak error 3.00 %")
-    assert lines[3].startswith("fitted: peak error 2.50 %")
+    assert lines[2] == "one note"
+    assert lines[3].startswith("not fitted: peak error 3.00 %")
+    assert lines[4].startswith("fitted: peak error 2.50 %")
     assert lines[-1] == "lag of the displacements: 2 samples"
 
 
