@@ -25,8 +25,9 @@ from hilctl import api
 from hilctl.base.types import F64
 from hilctl.experiment.load import load_experiment
 from hilctl.experiment.sections.compensator import begin, rests_at
+from hilctl.lab.identify.evaluation import QUANTILE
 from hilctl.loop.compensator import Compensator
-from hilctl.models.base import HysteresisModel, stroke_class
+from hilctl.models.base import STROKES, HysteresisModel, stroke_class
 from hilctl.models.model_file import load_model
 from hilctl.signals.cycle_metrics import expected_maximum
 from hilctl_drivers.simulated.actuator_base import Plant
@@ -78,7 +79,8 @@ class Result:
 
     Attributes:
         goal: Largest peak error allowed.
-        promise: Largest peak error by the model file, for the stroke of the reference.
+        stroke: Class of its stroke.
+        promise: Expected peak error by the model file, for that class.
         peak: Largest error of the displacement without sensor noise, offset included.
         mean: Mean error, the offset.
         noise: Largest sensor noise expected in as many samples.
@@ -89,6 +91,7 @@ class Result:
     group: str
     reference: str
     goal: float
+    stroke: str
     promise: float
     peak: float
     mean: float
@@ -171,6 +174,7 @@ class Rig:
             group=row.group,
             reference=row.name,
             goal=GOALS[row.group],
+            stroke=stroke,
             promise=self.model.provenance.errors_by_stroke.get(stroke, math.inf),
             peak=to_percent * float(np.max(np.abs(error_um))),
             mean=to_percent * float(error_um.mean()),
@@ -203,6 +207,17 @@ def summary(results: Sequence[Result]) -> dict[str, dict[str, Any]]:
     return found
 
 
+def promises(results: Sequence[Result]) -> dict[str, dict[str, float]]:
+    """Return the 90 % quantile of the errors of each class of strokes, and the promise over it."""
+    found = {}
+    for stroke in STROKES:
+        if rows := [result for result in results if result.stroke == stroke]:
+            quantile = float(np.percentile([row.peak for row in rows], QUANTILE))
+            promise = rows[0].promise
+            found[stroke] = {"promise": promise, "error": quantile, "ratio": promise / quantile}
+    return found
+
+
 def show(name: str, options: argparse.Namespace) -> dict[str, Any]:
     """Print the tables of one rig, and return them as a mapping."""
     say = partial(print, file=sys.stderr if options.json else sys.stdout, flush=True)
@@ -222,10 +237,14 @@ def show(name: str, options: argparse.Namespace) -> dict[str, Any]:
     say(f"{'class':12} {'worst %':>7} {'goal':>5} {'met':>5} {'promise':>7}")
     for group, of in groups.items():
         say(f"{group:12} {of['worst']:7.3f} {of['goal']:5g} {of['met']:5.0%} {of['held']:7.0%}")
+    strokes = promises(results)
+    say(f"{'stroke':16} {'promise':>7} {'90 % of references':>18} {'ratio':>5}")
+    for stroke, of in strokes.items():
+        say(f"{stroke:16} {of['promise']:7.2f} {of['error']:18.2f} {of['ratio']:5.2f}")
     return {
         "rig": name,
         "settings": settings,
-        "promise": dict(rig.model.provenance.errors_by_stroke),
+        "strokes": strokes,
         "classes": groups,
         "rows": [asdict(result) for result in results],
     }
