@@ -20,6 +20,8 @@ author = "The hilctl developers"
 version = release = hilctl.__version__
 html_title = f"{project} {version}"
 
+# An exception is found by the name of its module too, beside that of hilctl.api.
+suppress_warnings = ["ref.python"]
 extensions = [
     "myst_parser",
     "sphinx.ext.autodoc",
