@@ -83,10 +83,10 @@ def experiment(
     return load_experiment(EXPERIMENT, [*(f"{k}={value}" for k, value in own.items()), *settings])
 
 
-def job(folder: RunFolder, checked: CheckedExperiment) -> Job:
+def job(folder: RunFolder, axes: Sequence[CheckedExperiment]) -> Job:
     """Return what the supervisor hands to the loop process, without a heartbeat timeout."""
     return Job.of(
-        CheckedRun((checked,)),
+        CheckedRun((*axes,)),
         folder,
         locks=[],
         take_over=False,
@@ -116,20 +116,25 @@ def ticks_us(
     loop_process.SystemClock = TimedClock  # type: ignore[misc]
     with tempfile.TemporaryDirectory(prefix="hilctl-", dir=memory_folder()) as name:
         folder = RunFolder(Path(name), RunCard("tick", "tick", "", os.getpid(), 0.0))
-        ring = SampleRing.create(
-            folder.ring,
-            slots=slots,
-            block=options.block,
-            state_size=checked.state_size,
-            aux=len(checked.loaded.device.info.aux),
-        )
-        work = job(folder, checked)
-        threading.Thread(target=start, args=(ring.page,), daemon=True).start()
-        outcome = loop_process.run_job(work, [ring])
-        heads = [batch.heads for batch in ring.batches()]
-    if outcome.code != "completed" or not heads:
+        names = [f"axis{k}" for k in range(options.axes)] if options.axes > 1 else [""]
+        axes = [replace(checked, loaded=replace(checked.loaded, axis=name)) for name in names]
+        work = job(folder, axes)
+        rings = [
+            SampleRing.create(
+                Path(each.ring),
+                slots=slots,
+                block=options.block,
+                state_size=checked.state_size,
+                aux=len(checked.loaded.device.info.aux),
+            )
+            for each in work.axes
+        ]
+        threading.Thread(target=start, args=(rings[0].page,), daemon=True).start()
+        outcome = loop_process.run_job(work, rings)
+        heads = [np.concatenate([batch.heads for batch in ring.batches()]) for ring in rings]
+    if outcome.code != "completed":
         sys.exit(f"the run ended as {outcome.code}: {outcome.reason}")
-    exchange_ns = np.concatenate(heads)[:, BlockHeader.EXCHANGE_NS]
+    exchange_ns = np.sum([each[:, BlockHeader.EXCHANGE_NS] for each in heads], axis=0)
     slept, woke = np.array([TimedClock.slept, TimedClock.woke])
     busy_ns = slept[1:] - woke[:-1] - exchange_ns[: slept.size - 1]
     return busy_ns[: options.ticks] * 1e-3, exchange_ns[: options.ticks] * 1e-3
@@ -147,6 +152,7 @@ def main() -> int:
     parser.add_argument("--ticks", type=int, default=10_000)
     parser.add_argument("--rate", type=float, default=1000.0, help="samples per second")
     parser.add_argument("--block", type=int, default=1, help="samples per tick")
+    parser.add_argument("--axes", type=int, default=1, help="equal axes, exchanged in turn")
     parser.add_argument("--aux", action="store_true", help="compare with four auxiliary channels")
     parser.add_argument("--priority", type=int, default=80)
     parser.add_argument("--model", type=Path, help="model file; default: Omega and staged")
