@@ -10,7 +10,7 @@ import pytest
 
 from hilctl_drivers.emulator.options import EmulatorOptions, parse_fault
 from hilctl_drivers.signal_chain import Amplifier, Sensor
-from tests.fakes import emulated, logged
+from tests.fakes import emulated, logged, one_rig
 
 ROOT = Path(__file__).parents[2]
 GIVE_UP_S = 120.0
@@ -101,7 +101,7 @@ def test_failure_ends_at_the_safe_value(suite):
 @pytest.mark.slow
 def test_amplifier_that_is_off_is_found(suite):
     off = Amplifier(gain_a_per_v=1e-9, offset_a=-2.5e-9), Sensor(um_per_v=12.5)
-    done, currents_a = suite(only="small_move", wiring=off)
+    done, currents_a = suite(only="small_move", rigs=one_rig(wiring=off))
     assert done.returncode == 1
     assert "nothing moved" in done.stdout
     assert currents_a[-1] == 0.0
