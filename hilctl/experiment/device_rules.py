@@ -118,9 +118,9 @@ def output_problems(axes: Mapping[str, DeviceInfo]) -> Iterator[tuple[str, Confi
     for (first, one), (second, other) in combinations(axes.items(), 2):
         shared = sorted(set(one.holds) & set(other.holds))
         if shared and one.output == other.output:
-            output = f"{other.output} of {shared[0]}" if other.output else shared[0]
-            rule = f"{output} is that of {first}: each axis needs its own"
-            yield second, broken("device.output" if other.output else "device", rule)
+            key = "device.output" if other.output else "device"
+            rule = f"must not be that of {first} on {shared[0]}"
+            yield second, broken(key, rule, hint="each axis needs its own")
 
 
 def clock_problems(
