@@ -46,6 +46,7 @@ LEAF_STAGES = {
     "two_modes": ("modes=[[760, 0.03, 0.7], [930, 0.03, 0.3]]",),
 }
 LEAF_STAGES["all"] = tuple(each for added in LEAF_STAGES.values() for each in added)
+DRAWS = (1, 2, 3)
 RIGS: dict[str, tuple[str, ...]] = {
     "pinned_cells": ("terfenol_sine_6a.yaml",),
     **{
@@ -66,6 +67,25 @@ RIGS: dict[str, tuple[str, ...]] = {
             *(f"device.{each}" for each in added),
         )
         for name, added in LEAF_STAGES.items()
+    },
+    **{
+        f"anisotropic_rod_{draw}": (
+            "terfenol_sine_6a.yaml",
+            "device.kind=simulated_anisotropic_rod",
+            "limits.stroke_um=[-145, 145]",
+            f"device.draw={draw}",
+        )
+        for draw in DRAWS
+    },
+    **{
+        f"relaxor_{draw}": (
+            "piezo_sine.yaml",
+            "device.kind=simulated_relaxor",
+            "limits.slew_v_per_s=200000",
+            "limits.stroke_um=[-5, 48]",
+            f"device.draw={draw}",
+        )
+        for draw in DRAWS
     },
 }
 """Experiment file and settings of each rig."""

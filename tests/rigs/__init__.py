@@ -17,6 +17,8 @@ DEVICES = {
     "simulated_growing_lag": "tests.rigs.devices:SimulatedGrowingLag",
     "simulated_thermal_switching": "tests.rigs.devices:SimulatedThermalSwitching",
     "simulated_leaf_stage": "tests.rigs.devices:SimulatedLeafStage",
+    "simulated_anisotropic_rod": "tests.rigs.devices:SimulatedAnisotropicRod",
+    "simulated_relaxor": "tests.rigs.devices:SimulatedRelaxor",
     "simulated_framed": "tests.rigs.frame:SimulatedFramed",
 }
 

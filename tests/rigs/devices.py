@@ -6,10 +6,12 @@ from hilctl.base.strict import Field
 from hilctl_drivers.simulated.devices import SimulatedTerfenol, TerfenolOptions
 from hilctl_drivers.simulated.pinned_cells import PinnedCellsParameters
 from hilctl_drivers.simulated.simulated_device import SimulatedDevice, SimulatedOptions
+from tests.rigs.anisotropic_rod import AnisotropicRod, AnisotropicRodParameters
 from tests.rigs.diffusion import DiffusionParameters
 from tests.rigs.domains import DomainsParameters
 from tests.rigs.jiles_atherton import GrowingLagParameters, JilesAthertonParameters
 from tests.rigs.leaf_stage import LeafStage, LeafStageParameters
+from tests.rigs.relaxor import Relaxor, RelaxorParameters
 from tests.rigs.thermal_switching import SwitchingActuator, SwitchingParameters
 
 RODS = {
@@ -64,11 +66,27 @@ class SimulatedGrowingLag(SimulatedTerfenol):
     Options: ClassVar = GrowingLagOptions
 
 
+class SimulatedStack(SimulatedDevice):
+    """A device around ``_parameters`` of a stack with a capacitive sensor; commands in V."""
+
+    def __init__(self, options, name, description):
+        super().__init__(
+            options,
+            self._parameters,
+            name=f"simulated_{name}",
+            description=f"{description}, and capacitive sensor",
+            command_unit="V",
+            command_min=self._parameters.drive_min_v,
+            command_max=self._parameters.drive_max_v,
+            command_step=self._parameters.drive_max_v / self._parameters.dac_codes,
+        )
+
+
 class SwitchingOptions(SimulatedOptions):
     sensor_noise_um: float = Field(default=1e-3, ge=0.0, le=1.0, description="rms noise, um")
 
 
-class SimulatedThermalSwitching(SimulatedDevice):
+class SimulatedThermalSwitching(SimulatedStack):
     """A piezo stack whose domains switch over barriers by thermal activation; commands in V."""
 
     Options: ClassVar = SwitchingOptions
@@ -78,14 +96,7 @@ class SimulatedThermalSwitching(SimulatedDevice):
         noise_um = options.sensor_noise_um if options.noise else 0.0
         self._parameters = SwitchingParameters(sensor_noise_um=noise_um)
         super().__init__(
-            options,
-            self._parameters,
-            name="simulated_thermal_switching",
-            description="simulated piezo stack with thermal activation, and capacitive sensor",
-            command_unit="V",
-            command_min=self._parameters.drive_min_v,
-            command_max=self._parameters.drive_max_v,
-            command_step=self._parameters.drive_max_v / self._parameters.dac_codes,
+            options, "thermal_switching", "simulated piezo stack with thermal activation"
         )
 
     def plant(self, sample_rate_hz):
@@ -103,7 +114,7 @@ class LeafStageOptions(SimulatedOptions):
     )
 
 
-class SimulatedLeafStage(SimulatedDevice):
+class SimulatedLeafStage(SimulatedStack):
     """A piezo stage on leaf springs with accommodation, creep, friction and modes."""
 
     Options: ClassVar = LeafStageOptions
@@ -115,17 +126,54 @@ class SimulatedLeafStage(SimulatedDevice):
             **{key: getattr(options, key) for key in keys},
             sensor_noise_um=2e-3 if options.noise else 0.0,
         )
-        super().__init__(
-            options,
-            self._parameters,
-            name="simulated_leaf_stage",
-            description="simulated piezo stage on leaf springs, and capacitive sensor",
-            command_unit="V",
-            command_min=self._parameters.drive_min_v,
-            command_max=self._parameters.drive_max_v,
-            command_step=self._parameters.drive_max_v / self._parameters.dac_codes,
-        )
+        super().__init__(options, "leaf_stage", "simulated piezo stage on leaf springs")
 
     def plant(self, sample_rate_hz):
         """Return the stage at rest."""
         return LeafStage(self._parameters, sample_rate_hz, self._seed)
+
+
+class DrawnOptions(SimulatedOptions):
+    draw: int = Field(default=0, ge=0, description="seed of the constants; 0: nominal ones")
+
+
+class SimulatedRelaxor(SimulatedStack):
+    """An electrostrictive stack whose polarisation relaxes over many decades."""
+
+    Options: ClassVar = DrawnOptions
+
+    def __init__(self, options):
+        self._seed = options.seed
+        noise_um = 2e-3 if options.noise else 0.0
+        self._parameters = RelaxorParameters(sensor_noise_um=noise_um).drawn(options.draw)
+        super().__init__(options, "relaxor", "simulated electrostrictive stack")
+
+    def plant(self, sample_rate_hz):
+        """Return the stack at rest."""
+        return Relaxor(self._parameters, sample_rate_hz, self._seed)
+
+
+class SimulatedAnisotropicRod(SimulatedDevice):
+    """A rod under prestress that saturates and gets stiffer; commands in A."""
+
+    Options: ClassVar = DrawnOptions
+
+    def __init__(self, options):
+        self._seed = options.seed
+        noise_um = 0.02 if options.noise else 0.0
+        nominal = AnisotropicRodParameters(sensor_noise_um=noise_um)
+        self._parameters = nominal.drawn(options.draw)
+        super().__init__(
+            options,
+            self._parameters,
+            name="simulated_anisotropic_rod",
+            description="simulated rod under prestress, linear amplifier and capacitive sensor",
+            command_unit="A",
+            command_min=-self._parameters.dac_range_a,
+            command_max=self._parameters.dac_range_a,
+            command_step=self._parameters.dac_range_a / self._parameters.dac_codes,
+        )
+
+    def plant(self, sample_rate_hz):
+        """Return the rod at rest."""
+        return AnisotropicRod(self._parameters, sample_rate_hz, self._seed)
