@@ -197,8 +197,8 @@ class HysteresisModel(CheckedModel, ABC):
         kind: Registered name of the class.
         input_unit: Unit of the command, ``A`` or ``V``.
         input_range: Lowest and highest command of the identification.
-        output_range_um: Lowest and highest displacement of the identification; a reference outside
-            is rejected.
+        output_range_um: Lowest and highest displacement of the identification that a steady command
+            reaches; a reference outside is rejected.
         output_offset_um: Displacement at which the operators' output is 0.
         provenance: Origin of the parameters.
     """

@@ -19,6 +19,7 @@ import hilctl
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64, I64
 from hilctl.experiment.model_validity import ALL, QUIET, spectrum
+from hilctl.experiment.sections.compensator import rests_at
 from hilctl.lab.identify.data.records import (
     FEWEST_POINTS,
     History,
@@ -31,10 +32,12 @@ from hilctl.lab.identify.evaluation import Evaluation, judge
 from hilctl.lab.identify.fit_api import FitJob, FitRequest, FoundModel
 from hilctl.lab.identify.fit_data import FitData
 from hilctl.lab.identify.resonances import without_modes
-from hilctl.models.base import IdentifiedRange, Provenance
+from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
 from hilctl.models.linear_stages import CreepModel
+from hilctl.models.staged import StagedModel
 from hilctl.signals import cycle_metrics
 
+_REST_RATE_HZ = 10e3  # to simulate a rest, for records of unknown sample rate
 COARSE_S = 1e-3
 LEAST_REST_S = 0.5
 STILL = 1e-6  # largest change per sample at rest, as a share of the command's range
@@ -218,7 +221,6 @@ def fit_kind(request: FitRequest) -> FoundModel:
         numbers += len(type(mode).model_fields)
     if not known:
         return found
-    known["output_range_um"] = FitData(records, unit).output_range_um
     model = found.model.model_copy(update=known)
     return replace(found, model=model, numbers=numbers, parameters=parameters)
 
@@ -321,9 +323,22 @@ def fit_model(request: FitRequest) -> FittedModel:
         versions=VERSIONS,
     )
     request.progress(1.0, "done")
-    model = found.model.model_copy(update={"provenance": provenance})
+    update = {"provenance": provenance, "output_range_um": _range_um(found.model, data)}
+    model = found.model.model_copy(update=update)
     known = vars(judged) | vars(found) | {"model": model, "end": None}
     return FittedModel(**known, elapsed_s=time.perf_counter() - begin)
+
+
+def _range_um(model: HysteresisModel, data: FitData) -> tuple[float, float] | None:
+    """Return the displacements of the records that a steady command reaches, too.
+
+    Fast loops excite the structure, so they may reach far beyond those of a slow reference.
+    """
+    if not isinstance(model, StagedModel):
+        return model.output_range_um
+    rate_hz = 0.5 / data.half_period_s if data.half_period_s else _REST_RATE_HZ
+    low_um, high_um = sorted(rests_at(model, rate_hz, command) for command in data.input_range)
+    return max(low_um, data.output_range_um[0]), min(high_um, data.output_range_um[1])
 
 
 def _grid_line(record: Record) -> str:
