@@ -50,6 +50,12 @@ TRIGGERED = "triggered"
 Values: ``waited_s``, since the run was ready to start.
 """
 
+ON_TARGET = "on_target"
+"""Event code of a change of the on-target flag, at its sample; at most ten per second.
+
+Values: ``on``, 1 or 0; ``changes``, their number since the event before.
+"""
+
 LOST_READINGS = "lost_readings"
 """Event code at the end of a run in which readings of a sensor that sends unasked did not arrive.
 

@@ -311,6 +311,8 @@ class Flag(IntFlag):
     """The inverse was bypassed, partly or completely, by a line."""
     TRIGGER = 1 << 19
     """The digital output was set with this sample, because a mark of the waveform is due."""
+    ON_TARGET = 1 << 20
+    """The displacement had been within the tolerance of ``on_target`` for long enough."""
 
 
 NO_WAVEFORM = Flag.RAMP | Flag.CONDITION

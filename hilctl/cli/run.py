@@ -356,6 +356,8 @@ def _supervised_rows(checked: CheckedExperiment) -> dict[str, str]:
     if (apart := config.apart) is not None:
         more = f"more{for_longer_than(apart.for_s)} ends the run"
         rows["apart"] = f"{' and '.join(apart.axes)} at most {apart.um:g} µm; {more}"
+    if (target := config.on_target) is not None:
+        rows["on target"] = f"within {target.tolerance_um:g} µm for {target.settle_s:g} s"
     if aux := checked.loaded.rig.aux:
         rows["auxiliary"] = "; ".join(f"{each.channel.name}: {each}" for each in aux)
     if (trigger := _trigger(checked)) is not None:
@@ -389,7 +391,9 @@ def _trigger_text(known: dict[str, Any], tick_s: float) -> str:
     if known["start"]:
         parts.append("starts with {digital_input} {start}, at most {timeout_s:g} s")
     if known["output"]:
-        parts.append("{digital_output} is high for one sample at each {output} ({marks})")
+        mark = "for one sample at each {output} ({marks})"
+        when = "on target" if known["output"] == "on_target" else mark
+        parts.append(f"{{digital_output}} is high {when}")
         if cost_s := known["digital_output_s"]:
             parts[-1] += f", in {1e3 * cost_s:.2g} of {1e3 * tick_s:.3g} ms"
     return "; ".join(parts).format(**known)

@@ -29,6 +29,7 @@ from hilctl.experiment.sections.trigger import Trigger
 from hilctl.loop.adaptation import AdaptationBounds
 from hilctl.loop.interlocks import ApartSettings
 from hilctl.loop.limiter import CommandLimits
+from hilctl.loop.on_target import OnTargetSettings
 from hilctl.machine.rt_setup import Realtime
 from hilctl.waveforms.spec import AnyWaveform
 
@@ -71,8 +72,9 @@ class Experiment(StrictModel):
             ``limits.stroke_um``.
         feedback: Controller around the compensator. Default: none.
         adaptation: Adaptation of the compensator's model during the run. Default: none.
-        trigger: Digital output at marks of the waveform, and start by a digital input. Default:
-            none. Of several axes, the first one has the marks and the channels.
+        trigger: Digital output at marks of the waveform or on target, and start by a digital
+            input. Default: none. Of several axes, the first one has the marks and the channels.
+        on_target: Tolerance and settling time of the on-target flag. Default: no flag.
         apart: Interlock on the difference of the displacements of two axes. Default: none.
         limits: Limits of the run.
         safe: The safe value, and the safe ramp to it.
@@ -101,6 +103,7 @@ class Experiment(StrictModel):
     feedback: FeedbackConfig | None = None
     adaptation: AdaptationConfig | None = None
     trigger: Trigger | None = None
+    on_target: OnTargetSettings | None = None
     apart: ApartSettings | None = None
     limits: Limits
     safe: Safe = Field(default_factory=Safe)

@@ -70,7 +70,7 @@ from hilctl.experiment.sections.timing import (
     silence_limits,
     timeout_warnings,
 )
-from hilctl.experiment.sections.trigger import mark_problems, trigger_problems
+from hilctl.experiment.sections.trigger import mark_problems, on_target_problems, trigger_problems
 from hilctl.experiment.state_files import MachineTime
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.lead_in import Conditioning
@@ -337,6 +337,7 @@ def _section_problems(loaded: LoadedExperiment) -> Iterator[ConfigProblem]:
     compensated = config.compensator is not None
     yield from interlock_problems(config.limits, info, compensated=compensated)
     yield from trigger_problems(config.trigger, rig)
+    yield from on_target_problems(config.on_target, config.trigger, compensated=compensated)
     yield from zero_problems(zero=config.zero, offset=config.measures_offset)
     yield from condition_problems(config.condition, rig)
     rate_hz = config.sample_rate_hz

@@ -2,6 +2,6 @@
 
 PUBLIC = (
     "adaptation", "block", "compensator", "feedback", "interlocks", "lead_in", "limiter", "loop",
-    "pacer", "plan", "safe_output", "triggers", "tuning",
+    "on_target", "pacer", "plan", "safe_output", "triggers", "tuning",
 )  # fmt: skip
 """Modules that other packages import; the others are private."""

@@ -227,6 +227,9 @@ class AxisChain:
                 self.plan.feedback.take(block)
             if self.plan.adaptation is not None:
                 self.plan.adaptation.take(block)
+        # Last: feedback and adaptation ignore samples with flags.
+        if (target := self.plan.on_target) is not None and (event := target.take(block)):
+            self.lane.record_event(event)
         if trip is not None:
             self.trip, self.guarded = trip, block.guarded
         return trip is not None

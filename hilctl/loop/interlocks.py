@@ -360,7 +360,7 @@ class ApartInterlock:
 
     def __init__(self, settings: ApartSettings, sample_rate_hz: float) -> None:
         self._settings = settings
-        self._limits = settings.um, _in_samples(settings.for_s, sample_rate_hz)
+        self._limits = settings.um, in_samples(settings.for_s, sample_rate_hz)
         self._run = np.zeros(1)
         self._apart_block = compiled(kernels.apart_block)
 
@@ -392,7 +392,7 @@ def for_longer_than(time_s: float | None) -> str:
     return f" for longer than {time_s:g} s" if time_s else ""
 
 
-def _in_samples(time_s: float, rate_hz: float) -> float:
+def in_samples(time_s: float, rate_hz: float) -> float:
     """Return a time in samples, rounded up; infinite if it is infinite."""
     count = time_s * rate_hz
     return float(math.ceil(round(count, 6))) if math.isfinite(count) else math.inf
@@ -412,12 +412,12 @@ def _numbers(context: InterlockContext, given: InterlockSettings, rate_hz: float
     numbers[[kernels.RAIL_LOW, kernels.RAIL_HIGH]] = context.sensor_um
     numbers[kernels.FROZEN_UM] = given.frozen_um or 0.0
     numbers[kernels.FROZEN_TRAVEL] = context.frozen_travel
-    numbers[kernels.FROZEN_SAMPLES] = _in_samples(_or_inf(given.frozen_s), rate_hz)
+    numbers[kernels.FROZEN_SAMPLES] = in_samples(_or_inf(given.frozen_s), rate_hz)
     numbers[kernels.DEVIATION] = deviation
-    numbers[kernels.DEVIATION_SAMPLES] = _in_samples(deviation_s, rate_hz)
+    numbers[kernels.DEVIATION_SAMPLES] = in_samples(deviation_s, rate_hz)
     numbers[kernels.WARMING] = warming(given.thermal_time_constant_s or 1.0, rate_hz)
     numbers[kernels.BUDGET] = _or_inf(given.rms_current_a) ** 2
     numbers[kernels.TRACKING_UM] = _or_inf(given.tracking_error_um)
-    numbers[kernels.TRACKING_SAMPLES] = _in_samples(given.tracking_s or 0.0, rate_hz)
-    numbers[kernels.MISSING_SAMPLES] = _in_samples(given.sensor_invalid_s or 0.0, rate_hz)
+    numbers[kernels.TRACKING_SAMPLES] = in_samples(given.tracking_s or 0.0, rate_hz)
+    numbers[kernels.MISSING_SAMPLES] = in_samples(given.sensor_invalid_s or 0.0, rate_hz)
     return numbers

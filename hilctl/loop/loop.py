@@ -30,7 +30,7 @@ from hilctl.loop.safe_output import (
     drive_to_safe,
     joint_report,
 )
-from hilctl.loop.triggers import PulseOutput
+from hilctl.loop.triggers import PulseOutput, TargetOutput
 
 _TRIGGER = int(Flag.TRIGGER)
 
@@ -89,7 +89,7 @@ class Loop:
         self._ended_at = 0
         self._condition_at = self._waveform_at = 0
         self._end = plan.samples
-        self._pulses: PulseOutput | None = None
+        self._pulses: PulseOutput | TargetOutput | None = None
         self._on_ramp = False
         self._exchange_ns = 0  # of the previous tick
         self._code: Code = "completed"
@@ -130,7 +130,8 @@ class Loop:
                 at = ", ".join(f"{each:g}" for each in outputs)
                 raise InputError(f"{rule}, but the output is at {at}: {cure}")
             device = cast(DigitalDevice, self._devices[0])
-            self._pulses = triggers.pulses(device, self._waveform_at)
+            targets = [each.plan.on_target for each in chains if each.plan.on_target is not None]
+            self._pulses = triggers.output(device, self._waveform_at, targets)
         if self._waveform_at:
             self._phase = _STARTING if self._condition_at else _CONDITIONING
             self._pacer.policy = plan.start_policy

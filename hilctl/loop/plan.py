@@ -14,6 +14,7 @@ from hilctl.loop.feedback import Controller
 from hilctl.loop.interlocks import ApartSettings, InterlockContext, InterlockSettings
 from hilctl.loop.lead_in import Conditioning
 from hilctl.loop.limiter import CommandLimits
+from hilctl.loop.on_target import OnTarget
 from hilctl.loop.pacer import LatePolicy, LateRules
 from hilctl.loop.triggers import Triggers
 from hilctl.loop.tuning import Tuning
@@ -39,6 +40,7 @@ class AxisPlan:
     feedback: Controller | None = None
     adaptation: Adaptation | None = None
     conditioning: Conditioning | None = None
+    on_target: OnTarget | None = None
     name: str = ""
 
 

@@ -1,7 +1,7 @@
 """Triggers: a digital output at marks of the waveform, and a start by a digital input."""
 
 import math
-from collections.abc import Iterable
+from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
 from typing import Literal, TypeAlias
 
@@ -11,8 +11,10 @@ from hilctl.base.device import DigitalDevice
 from hilctl.base.samples import LAST_SAMPLE
 from hilctl.base.segments import Segment
 from hilctl.base.types import I64
+from hilctl.loop.on_target import OnTarget
 
 MarkKind: TypeAlias = Literal["cycle", "segment", "run"]
+OutputKind: TypeAlias = Literal[MarkKind, "on_target"]
 Level: TypeAlias = Literal["high", "low"]
 
 SHORTEST_CYCLE = 2
@@ -28,14 +30,20 @@ class Triggers:
         marks: int64[m], samples of the waveform at which the digital output is set, in order.
         start: Level of the digital input that starts the run; None: the run starts immediately.
         timeout_s: Longest wait for this level.
+        on_target: Whether the digital output is high on target instead.
     """
 
     marks: I64
     start: Level | None = None
     timeout_s: float = math.inf
+    on_target: bool = False
 
-    def pulses(self, device: DigitalDevice, waveform_at: int) -> "PulseOutput | None":
-        """Return the digital output of a run by the waveform's first sample; None without marks."""
+    def output(
+        self, device: DigitalDevice, waveform_at: int, targets: Sequence[OnTarget]
+    ) -> "PulseOutput | TargetOutput | None":
+        """Return the digital output of a run by the waveform's first sample; None without one."""
+        if self.on_target:
+            return TargetOutput(device, targets)
         return PulseOutput(device, self.marks + waveform_at) if self.marks.size else None
 
 
@@ -81,3 +89,19 @@ class PulseOutput:
         """Return the first mark after a sample."""
         place = int(np.searchsorted(self._marks, sample, "right"))
         return int(self._marks[place]) if place < self._marks.size else LAST_SAMPLE
+
+
+class TargetOutput:
+    """The digital output of a run: high while all axes with a target are on it."""
+
+    def __init__(self, device: DigitalDevice, targets: Sequence[OnTarget]) -> None:
+        self._device, self._targets = device, targets
+        self._high = False
+
+    def follow(self, _sample: int, *, active: bool) -> bool:
+        """Set or reset the output by the answers so far; return False, because it has no mark."""
+        high = active and all(each.active for each in self._targets)
+        if high != self._high:
+            self._device.set_digital(high)
+            self._high = high
+        return False

@@ -12,6 +12,7 @@ from hilctl.experiment.sections.timing import late_policy, late_rules
 from hilctl.loop.adaptation import DisplacementOperator
 from hilctl.loop.compensator import Compensator
 from hilctl.loop.lead_in import Conditioning
+from hilctl.loop.on_target import OnTarget
 from hilctl.loop.pacer import LateRules
 from hilctl.loop.plan import AxisPlan, LoopPlan
 
@@ -48,6 +49,7 @@ def axis_plan(
         feedback=make_feedback(config.feedback, rig.exchange, compensator.preview),
         adaptation=make_adaptation(config.adaptation, operator, rate_hz, compensator.preview),
         conditioning=conditioning,
+        on_target=None if config.on_target is None else OnTarget(config.on_target, rate_hz),
         name=loaded.axis,
     )
 

@@ -113,6 +113,9 @@ ROWS = {
         "adaptation={noise_um: 0.05}", **ends(2, "adaptation", *MOVING, "learn"),
     ),
     "marks": driven("block=1", "trigger={output: cycle}"),
+    "on target": compensated(
+        "block=1", "on_target={tolerance_um: 0.5, settle_s: 0.001}", "trigger={output: on_target}"
+    ),
     "start by an input": compensated("block=1", "trigger={start: high, timeout_s: 30.0}"),
     "marks of blocks": compensated(
         "trigger={output: run}", **ends(2, "block", *MOVING, "learn"),

@@ -52,7 +52,8 @@ def without_reference(experiment: Path, settings: Sequence[str]) -> list[str]:
     document = document_with(experiment, settings)
     unit = "V" if document.holds(("limits", "drive_v")) else "A"
     hold = {"kind": "hold", "unit": unit, "level": 0.0, "duration_s": 1.0}
-    needing = ("feedback", "adaptation", "trigger", *(f"limits.{key}" for key in _tracking_keys()))
+    needing = ["feedback", "adaptation", "on_target", "trigger"]
+    needing += [f"limits.{key}" for key in _tracking_keys()]
     removed = [f"{key}=null" for key in needing if document.holds(tuple(key.split(".")))]
     return [*settings, setting("waveform", hold), "compensator=none", *removed]
 

@@ -4,7 +4,7 @@ from dataclasses import replace
 
 import pytest
 
-from hilctl.experiment.sections.trigger import trigger_problems
+from hilctl.experiment.sections.trigger import on_target_problems, trigger_problems
 from tests.unit.experiment.test_preflight import CURRENT, checked, loaded, refusals
 
 SHORT = "{kind: sine, amplitude: 1.0, frequency_hz: 1000.0, duration_s: 0.0011}"
@@ -23,6 +23,20 @@ def test_cycles_that_cannot_be_marked_are_refused(waveform, cure):
     (problem,) = refusals(CURRENT, *bad, digital_output="DO")
     assert (problem.key, problem.value) == ("trigger.output", "cycle")
     checked(CURRENT, *bad, cure, digital_output="DO")
+
+
+@pytest.mark.parametrize(
+    ("settings", "compensated", "keys"),
+    [
+        (["on_target={tolerance_um: 0.1}"], False, ["on_target"]),
+        (["trigger={output: on_target}"], True, ["trigger.output"]),
+        (["trigger={output: on_target}", "on_target={tolerance_um: 0.1}"], True, []),
+    ],
+)
+def test_on_target_needs_a_compensator_and_its_tolerance(settings, compensated, keys):
+    config = loaded(CURRENT, *settings, digital_output="DO").config
+    problems = on_target_problems(config.on_target, config.trigger, compensated=compensated)
+    assert [each.key for each in problems] == keys
 
 
 @pytest.mark.parametrize(

@@ -227,7 +227,8 @@ waveform: {kind: sine, unit: um, amplitude: 4.0, frequency_hz: 2.0, duration_s: 
 compensator: {model: nowhere.yaml}
 feedback: {limit_um: 1.0, bandwidth_hz: 10.0}
 adaptation: {noise_um: 0.1}
-trigger: {output: cycle, start: high}
+trigger: {output: on_target, start: high}
+on_target: {tolerance_um: 0.5}
 limits:
   {peak_current_a: 4.0, slew_a_per_s: 5000.0, stroke_um: [-50.0, 50.0], tracking_error_um: 5.0,
    tracking_s: 0.1, frozen_s: 1.0}
@@ -242,6 +243,7 @@ def test_settings_that_need_a_reference_are_removed(tmp_path, limits):
     loaded = load_experiment(path, [*settings, setting("waveform", keys)])
     config, limits = loaded.config, loaded.config.limits
     assert loaded.model is config.feedback is config.adaptation is config.trigger is None
+    assert config.on_target is None
     assert limits.tracking_error_um is limits.tracking_s is None
     assert limits.frozen_s == 1.0
     assert len(loaded.config.waveform.parts) == len(keys["parts"])
