@@ -152,6 +152,7 @@ class RunReportBuilder:
             lateness_by_minute=ticks.by_minute(),
             exchange_us=tick_lateness.percentiles_us(ticks.exchange_ns),
             busy_us=tick_lateness.percentiles_us(ticks.busy_ns),
+            tick_us=tick_lateness.parts_us(last, ticks),
             period_us=None if ticks.period_ns is None else ticks.period_ns * 1e-3,
             processes=processes_of(last),
             adapted=dict(adapted[-1]) if adapted else {},

@@ -115,6 +115,8 @@ class RunReport(RunMetrics):
         exchange_us: The same percentiles of the duration of exchanges with the device.
         busy_us: The same percentiles of the time from the deadline of a tick to the end of its
             exchange; the rest of its period is left.
+        tick_us: Mean time that a tick takes to ``wake``, ``compute`` and ``exchange``; it waits for
+            the rest of its period. Empty if not recorded.
         period_us: Time from one tick to the next; None without two ticks.
         adapted: Final parameters of the adaptation, see :data:`hilctl.base.events.ADAPTED`; empty
             without adaptation.
@@ -156,6 +158,7 @@ class RunReport(RunMetrics):
     lateness_by_minute: list[dict[str, float]]
     exchange_us: dict[str, float]
     busy_us: dict[str, float]
+    tick_us: dict[str, float]
     period_us: float | None
     adapted: dict[str, float]
     processes: dict[str, ProcessUsage]
@@ -208,6 +211,7 @@ def run_rows(report: RunReport) -> list[tuple[str, str]]:
         ("lateness", _percentiles(report.lateness_us)),
         ("exchange", _percentiles(report.exchange_us)),
         ("busy", _busy(report.busy_us, report.period_us)),
+        ("mean tick", _percentiles(report.tick_us)),
         *((f"{name} process", usage_text(each)) for name, each in report.processes.items()),
     ]
 

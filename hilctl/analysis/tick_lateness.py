@@ -20,6 +20,7 @@ class Quantiles:
 
     def __init__(self) -> None:
         self.size = 0  # number of values
+        self.total = 0.0
         self.largest = -math.inf  # -inf without any
         self._every = 1
         self._parts: list[Any] = []
@@ -30,6 +31,7 @@ class Quantiles:
             return
         self._parts.append(values[-self.size % self._every :: self._every].copy())
         self.size += values.size
+        self.total += float(values.sum())
         self.largest = max(self.largest, float(values.max()))
         while self.size > self._every * MOST_EXACT:
             self._every *= 2
@@ -108,6 +110,22 @@ def percentiles_us(times_ns: Quantiles) -> dict[str, float]:
         return {}
     values = [each * 1e-3 for each in times_ns.percentiles(list(_PERCENTILES.values()))]
     return {**dict(zip(_PERCENTILES, values, strict=True)), "max": times_ns.largest * 1e-3}
+
+
+def parts_us(recording: Recording, ticks: LatenessBuilder) -> dict[str, float]:
+    """Return the mean time in us that a tick takes to ``wake``, ``compute`` and ``exchange``.
+
+    Empty if it is unknown. Raise DataError if a recorded number is invalid.
+    """
+    wake_ns, count = counter(recording, "mean_wake_ns"), ticks.late_ns.size
+    if wake_ns is None or not count:
+        return {}
+    late_ns, exchange_ns = ticks.late_ns.total / count, ticks.exchange_ns.total / count
+    return {
+        "wake": wake_ns * 1e-3,
+        "compute": (late_ns - wake_ns) * 1e-3,
+        "exchange": exchange_ns * 1e-3,
+    }
 
 
 def misses(recording: Recording, ticks: int) -> str:

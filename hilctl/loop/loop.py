@@ -100,7 +100,7 @@ class Loop:
     @property
     def lateness(self) -> Lateness:
         """Exact counters of late ticks."""
-        return self._pacer.counters
+        return self._pacer.lateness
 
     def begin_at(self, outputs: Sequence[float]) -> int:
         """Set the present outputs, before :meth:`run`.

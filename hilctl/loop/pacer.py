@@ -6,7 +6,7 @@ import math
 import os
 import time
 from collections import deque
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from typing import TYPE_CHECKING, Literal, TypeAlias
 
 if TYPE_CHECKING:
@@ -65,13 +65,14 @@ class SystemClock:
 
 @dataclass(slots=True)
 class Lateness:
-    """Exact counters of late ticks, and the most consecutive ones (``longest_run``)."""
+    """Exact counters of late ticks, the most consecutive ones, and the mean lateness of all."""
 
     late_ticks: int = 0
     skipped_ticks: int = 0
     worst_ns: int = 0
     worst_tick: int = 0
     longest_run: int = 0
+    mean_wake_ns: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -126,6 +127,13 @@ class Pacer:
         self.late_ns = 0
         """Lateness of the last wake-up; after a skip, relative to the first missed tick."""
         self.counters = Lateness()
+        self._woke_ns = 0
+
+    @property
+    def lateness(self) -> Lateness:
+        """The counters and the mean so far."""
+        ticks = self.tick + 1 - self.counters.skipped_ticks
+        return replace(self.counters, mean_wake_ns=self._woke_ns // max(1, ticks))
 
     def begin(self, start_ns: int) -> None:
         """Set the time of the first tick."""
@@ -149,6 +157,7 @@ class Pacer:
         self._clock.sleep_until_ns(self.deadline_ns)
         now_ns = self._clock.now_ns()
         self.late_ns = now_ns - self.deadline_ns
+        self._woke_ns += self.late_ns
         # Usually there is nothing to count.
         if self.late_ns > self._least_counted_ns or self.late_run:
             self._count()
@@ -191,6 +200,7 @@ class Pacer:
             self._origin_ns += self.late_ns
             self.deadline_ns += self.late_ns
             self.late_ns = 0
+        self._woke_ns += self.late_ns
         self._origin_ns += round(self.late_ns * _FOLLOW)
         self._count()
 

@@ -163,6 +163,7 @@ def end_facts(
         "worst_late_ns": str(counters.worst_ns),
         "worst_late_tick": str(counters.worst_tick),
         "longest_late_run": str(counters.longest_run),
+        "mean_wake_ns": str(counters.mean_wake_ns),
         "dropped_in_ring": str(dropped),
         "lost_events": str(lost_events),
     }

@@ -261,4 +261,5 @@ DEFINITIONS = {
     "r²": "Share of the variance explained by a linear fit.",
     "lateness": "Time from a tick's deadline to its exchange; 99 % of the ticks are within p99.",
     "busy": "Time from a tick's deadline to the end of its exchange; the rest of a tick is left.",
+    "mean tick": "Mean time to wake after the deadline, to compute, and to exchange the block.",
 }

@@ -51,7 +51,7 @@ def run_body(recording: Recording, report: RunReport, before: Recording | None =
         # The end of an incomplete run is above.
         and (report.complete or name != "ended")
     ]
-    terms += [name for name, _ in samples if name in {"lateness", "busy"}]
+    terms += [name for name, _ in samples if name in {"lateness", "busy", "mean tick"}]
     return [
         html.paragraph(report.path, "file"),
         *_end(recording, report),

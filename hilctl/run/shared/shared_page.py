@@ -106,6 +106,7 @@ class PageField(IntEnum):
     RELIEVED = 82
     STANDS_IN = 83
     UNANSWERED = 84
+    MEAN_WAKE_NS = 85
 
 
 class Phase(IntEnum):
@@ -185,6 +186,7 @@ _LATENESS = (
     PageField.WORST_LATE_NS,
     PageField.WORST_LATE_TICK,
     PageField.LONGEST_LATE_RUN,
+    PageField.MEAN_WAKE_NS,
 )
 """The fields of :class:`~hilctl.loop.pacer.Lateness`, in its order."""
 

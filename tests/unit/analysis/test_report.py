@@ -327,12 +327,16 @@ class TestWholeRun:
             np.repeat(np.array([100_000, 700_000]), 50),
             np.full(100, 30_000),
         )
-        told = lagging(ticks=ticks, end={"late_ticks": "7", "skipped_ticks": "3"})
+        end = {"late_ticks": "7", "skipped_ticks": "3", "mean_wake_ns": "90000"}
+        told = lagging(ticks=ticks, end=end)
+        parts = {"wake": 90.0, "compute": 310.0, "exchange": 30.0}
+        assert summarize(told).tick_us == pytest.approx(parts)
         assert summarize(told).late_ticks == 7
         assert summarize(told).skipped_ticks == 3
         counted = summarize(replace(told, end={}))
         assert counted.late_ticks is None
         assert counted.skipped_ticks is None
+        assert counted.tick_us == {}
         misses = "deadline misses 3 of 103 (2.9 %)"
         assert summarize(told).deadline_misses.startswith(f"{misses}: ")
         kept = replace(told, run={**told.run, "max_missed_share": "0.9"})

@@ -66,6 +66,7 @@ def test_skipped_ticks_keep_the_phase():
     assert paced.tick == 6
     assert paced.deadline_ns == 10_000 + 6 * PERIOD_NS
     assert paced.counters.skipped_ticks == 3
+    assert paced.lateness.mean_wake_ns == 3_200_000 // 4
 
 
 @pytest.mark.parametrize("policy", ["skip", "spaced"])

@@ -33,7 +33,9 @@ from hilctl.run.start import checked_experiment
 
 EXPERIMENT = Path(__file__).parents[3] / "configs" / "demo.yaml"
 OUTCOME = LoopOutcome("stopped", "asked to", 400, "confirmed")
-COUNTERS = Lateness(late_ticks=1, skipped_ticks=2, worst_ns=3, worst_tick=4, longest_run=5)
+COUNTERS = Lateness(
+    late_ticks=1, skipped_ticks=2, worst_ns=3, worst_tick=4, longest_run=5, mean_wake_ns=6
+)
 FACTS = {
     "code": "stopped",
     "reason": "asked to",
@@ -44,6 +46,7 @@ FACTS = {
     "worst_late_ns": "3",
     "worst_late_tick": "4",
     "longest_late_run": "5",
+    "mean_wake_ns": "6",
     "dropped_in_ring": "50",
 }
 
