@@ -24,7 +24,7 @@ from hilctl.lab.identify.summary import (
 from hilctl.lab.pages import html
 from hilctl.lab.pages.figure_layout import FigureSpec, Panel
 from hilctl.lab.pages.plot_style import DISPLACEMENT, ERROR, PALE, min_max
-from hilctl.models.base import STROKES, HysteresisModel
+from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import dump_model
 
 MOST_RECORDS = 36
@@ -63,28 +63,16 @@ def _head(model: HysteresisModel, lines: Sequence[str]) -> list[str]:
 
 
 def errors_by_stroke(verdict: Verdict) -> list[str]:
-    """Return the grade and the errors of a verdict by stroke, with a table and a figure."""
-
-    def draw(axes: Axes) -> None:
-        strokes = [100.0 * STROKES[each.label] for each in verdict.classes]
-        for name, colour in (("peak", ERROR), ("median", PALE), ("rms", DISPLACEMENT)):
-            errors = [getattr(each, f"{name}_percent") for each in verdict.classes]
-            axes.semilogx(strokes, errors, "o-", color=colour, label=name)
-        axes.set_xticks(strokes, [f"{stroke:g}" for stroke in strokes])
-        axes.minorticks_off()
-        axes.set_ylim(bottom=0.0)
-        axes.set(xlabel="motion, % of the stroke", ylabel="error, %")
-
-    caption = (
-        "Errors by stroke, in percent of a motion's own peak-to-peak: 90 % of places and "
-        "frequencies have no larger one."
+    """Return the grade and the errors of a verdict by stroke."""
+    meaning = (
+        "Errors are in percent of a motion's own peak-to-peak; 90 % of places and frequencies "
+        "have no larger one than promised."
     )
-    figure = FigureSpec("strokes", caption, (Panel(draw, height=0.5),))
     return [
         "<h2>Errors by stroke</h2>",
         html.paragraph(verdict.headline),
         html.grid(*stroke_table(verdict)),
-        html.figures([figure]),
+        html.paragraph(meaning),
     ]
 
 

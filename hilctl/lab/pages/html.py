@@ -192,8 +192,12 @@ def svg(figure: Figure, alternative: str) -> str:
 
 def details(heading: str, plain: str) -> str:
     """Return a collapsed text."""
-    shown = text(plain, lines=True)
-    return f"<details><summary>{text(heading)}</summary><pre>{shown}</pre></details>"
+    return folded(heading, [f"<pre>{text(plain, lines=True)}</pre>"])
+
+
+def folded(heading: str, body: Iterable[str]) -> str:
+    """Return a collapsed part of a page; its body is HTML."""
+    return f"<details><summary>{text(heading)}</summary>{''.join(body)}</details>"
 
 
 def definitions(*terms: str) -> str:

@@ -164,6 +164,7 @@ def characterisation_page(found: Characterisation) -> str:
         (each.name, each.purpose, f"{each.seconds:.1f}", each.text, Path(each.recording).name)
         for each in found.steps
     ]
+    steps = html.grid(("step", "purpose", "time, s", "result", "recording"), rows)
     body = [
         html.paragraph(found.problem, "note") if found.problem else "",
         *_held_out(found),
@@ -171,8 +172,7 @@ def characterisation_page(found: Characterisation) -> str:
         html.grid(("quantity", "value"), value_rows(found)),
         html.figures(_sheets(found)),
         *_model(found),
-        "<h2>Steps</h2>",
-        html.grid(("step", "purpose", "time, s", "result", "recording"), rows),
+        steps if found.problem else html.folded("Steps", [steps]),
     ]
     return html.document(f"{found.experiment}: {found.device}", body)
 
@@ -188,12 +188,7 @@ def _held_out(found: Characterisation) -> list[str]:
         *map(html.paragraph, found.verdict.notes if found.verdict else ()),
         "<h2>Errors by reference</h2>",
         html.grid(HELD_OUT_HEADINGS, held_out_rows(found)),
-        html.figures(
-            [
-                held_out_sheet(first, close=True),
-                *(held_out_sheet(each, close=False) for each in found.held_out),
-            ]
-        ),
+        html.figures(held_out_sheet(each, close=each is first) for each in found.held_out),
     ]
 
 
@@ -226,6 +221,6 @@ def _model(found: Characterisation) -> Iterator[str]:
     yield from map(html.paragraph, details(known))
     if known.candidates:
         yield html.grid(*candidate_table(known))
-    yield html.grid(*loop_table(fit.errors))
-    yield from drawn_records(fit, known.data, fit.model.input_unit)
+    figures = drawn_records(fit, known.data, fit.model.input_unit)
+    yield html.folded("Fitted data", [html.grid(*loop_table(fit.errors)), *figures])
     yield html.details("Model file", dump_model(fit.model))

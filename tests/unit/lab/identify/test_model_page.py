@@ -49,7 +49,7 @@ def test_the_page_fetches_nothing_and_shows_names_as_they_are(page_of):
 def test_data_not_fitted_have_errors_and_figures_of_their_own(page_of, data_of):
     loops = data_of(TRUTH).loops
     page = page_of((loops[0],) * 3)
-    assert page.count("<svg") == 1 + len(loops) + 3
+    assert page.count("<svg") == len(loops) + 3
     shown = "".join(drawn_records(judge(TRUTH, (loops[0],) * 3), (loops[0],) * 3, "A", most=2))
     assert shown.count("<svg") == 2
     assert "first 2 of 3" in shown

@@ -71,6 +71,7 @@ def test_the_held_out_error_comes_first():
     assert "a note" in page
     assert "http://" not in page
     assert page.count("<figcaption") == page.count("<svg") > 5
+    assert page.index("<details") < page.index("Fitted data") < page.rindex("<figcaption")
 
 
 def test_the_problem_is_at_the_top():
