@@ -14,8 +14,10 @@ moved, and that no file was written.
 """
 
 from importlib import import_module
+from inspect import isfunction
 from typing import TYPE_CHECKING
 
+from hilctl.api.words import in_own_words
 from hilctl.base.errors import (
     ConfigError,
     DataError,
@@ -80,4 +82,7 @@ if not TYPE_CHECKING:
         if name not in __all__:
             raise AttributeError(f"module {__name__!r} has no attribute {name!r}")
         module = next((each for each, names in _OTHERS.items() if name in names), "recordings")
-        return getattr(import_module(f"{__name__}.{module}"), name)
+        found = getattr(import_module(f"{__name__}.{module}"), name)
+        if isfunction(found):
+            found = globals()[name] = in_own_words(found)
+        return found

@@ -12,6 +12,7 @@ import sys
 from typing import NoReturn
 
 from hilctl import OWN_ENVIRONMENT
+from hilctl.api.words import options_kept
 from hilctl.base.errors import ConfigError, HilctlError, RunError
 from hilctl.base.files import reason
 from hilctl.cli.output import (
@@ -45,7 +46,8 @@ def main() -> None:
         # With stty tostop, output of a background job would suspend it: a supervisor, or a command
         # between its runs.
         signal.signal(signal.SIGTTOU, signal.SIG_IGN)
-    with safe_streams(acts=acts), output_as_requested(as_json="--json" in sys.argv):
+    output = output_as_requested(as_json="--json" in sys.argv)
+    with safe_streams(acts=acts), output, options_kept():
         try:
             _run_app()
         except HilctlError as error:
