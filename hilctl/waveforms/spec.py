@@ -59,7 +59,10 @@ class _Shape(StrictModel):
         " duration",
     )
     soft_end_s: NotNegative = Field(
-        default=0.0, description="duration of the fade to rest, s; part of the waveform's duration"
+        default=0.0,
+        description="duration of the fade to rest, s; part of the waveform's duration. Leave it at"
+        " 0 for a unipolar drive, which has no command for rest after a motion; the safe ramp"
+        " follows the waveform",
     )
 
     @property
