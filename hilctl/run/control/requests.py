@@ -29,7 +29,9 @@ from hilctl.base.formatting import did_you_mean
 from hilctl.base.private_dirs import private_folder
 from hilctl.base.strict import HALF_CHARACTER, StrictModel, first_problem, without_halves
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
+from hilctl.kernels.interlock import apart_block
 from hilctl.loop.compensator import Compensator
+from hilctl.loop.interlocks import in_samples
 from hilctl.run.control.client import (
     MAX_BYTES,
     MAX_MARK,
@@ -177,6 +179,7 @@ _LEAD_S = 0.05  # time from the answer to the first sample of a change
 _ROUNDING = 1e-9  # relative; a run at its slew limit still accepts an offset
 _TOGETHER = "coupling: the axes are decoupled for equal changes: change all of them, without a name"
 _ONE_AXIS = "the run has one axis: change it without the name {!r}"
+_CHUNK = 1_000_000
 _CYCLE = 2000  # samples per cycle of the sine from which the command range is computed
 
 
@@ -283,6 +286,7 @@ class Changes:
         """Write the changes of some axes to their pages; return the answer."""
         states = {name: replace(self._states[name], **each) for name, each in changes.items()}
         _refuse({name: self._bound_refusal(name, state) for name, state in states.items()})
+        _refuse({"": self._apart_refusal(self._states | states)})
         page, config = self._page, self._run.config
         lead = max(1, round(_LEAD_S * config.sample_rate_hz))
         blocks = math.ceil((page.get(PageField.NEXT_SAMPLE) + lead) / config.block) + 1
@@ -310,6 +314,25 @@ class Changes:
         """Return why the reference of an axis cannot change to a state, or an empty text."""
         bypassed = min(state.inverse_share, self._states[name].inverse_share) < 1.0
         return bound_refusal(self._axes[name][0], state.gain, state.offset, bypassed=bypassed)
+
+    def _apart_refusal(self, states: Mapping[str, ReferenceState]) -> str:
+        """Return why references in these states would trip ``apart``, or an empty text."""
+        run, apart = self._run, self._run.config.apart
+        if apart is None:
+            return ""
+        pair = [(self._axes[name][0].reference, states[name]) for name in apart.axes]
+        if any(reference.unit != "um" for reference, _ in pair):
+            return ""
+        samples = in_samples(apart.for_s, run.config.sample_rate_hz)
+        counted = np.zeros(1)
+        for start in range(0, pair[0][0].values.size, _CHUNK):
+            part = slice(start, start + _CHUNK)
+            one, other = (each.gain * of.values[part] + each.offset for of, each in pair)
+            flags = np.zeros(one.size, np.uint32)
+            if apart_block(apart.um, samples, counted, one, other, flags, flags) >= 0:
+                names = " and ".join(apart.axes)
+                return f"the references of {names} would be more than {apart.um:g} µm apart (apart)"
+        return ""
 
 
 def _refuse(reasons: Mapping[str, str]) -> None:

@@ -19,6 +19,7 @@ from hilctl.base.events import MARK
 from hilctl.base.yaml import Document
 from hilctl.experiment.load import resolve
 from hilctl.experiment.preflight import CheckedRun, check
+from hilctl.loop.interlocks import ApartSettings
 from hilctl.loop.tuning import LinearBypass
 from hilctl.models.staged import FieldLag, StagedModel
 from hilctl.run.control import client
@@ -385,6 +386,24 @@ def test_a_refused_axis_keeps_all_from_changing(axes, values, said):
         change_axes(changes, **values)
     assert [bytes(each.numbers) for each in pages] == before
     assert changes.references()["references"]["x"]["gain"] == 1.0
+
+
+@pytest.mark.parametrize(("for_s", "gain", "refused"), [
+    (0.0, 0.76, False), (0.0, 0.74, True), (0.01, 0.74, False), (0.01, 0.7, True),
+])  # fmt: skip
+def test_a_pair_is_not_moved_apart(experiment, page, for_s, gain, refused):
+    """A sine of 4 um at 10 Hz; a gain of 0.7 leaves 1.2 um, beyond 1 um for 19 ms."""
+    run, pages = axes_of(experiment, experiment), [page, SharedPage(mmap(-1, SIZE))]
+    apart = ApartSettings(axes=("x", "y"), um=1.0, for_s=for_s)
+    config = run.config.model_copy(update={"apart": apart})
+    first = replace(run.first, loaded=replace(run.first.loaded, config=config))
+    changes = Changes(replace(run, axes=(first, run.axes[1])), pages)
+    if refused:
+        with pytest.raises(InputError, match=r"set: .*apart"):
+            change_axes(changes, axes={"x": {"gain": gain}})
+        change_axes(changes, gain=gain)
+    else:
+        change_axes(changes, axes={"x": {"gain": gain}})
 
 
 def test_a_run_of_one_axis_has_no_name(changes):
