@@ -337,9 +337,12 @@ def _forecast_rows(checked: CheckedExperiment) -> dict[str, str]:
     if config.amplifier is not None and forecast.voltage_v is not None:
         rows["voltage"] = f"{forecast.voltage_v:.4g} V (limit {config.amplifier.voltage_max_v:g})"
     if (expected := checked.expected) is not None:
+        median = expected.median_percent
         rows["model error"] = (
             f"{expected.percent:.2g} % of a motion's peak-to-peak at {expected.stroke}, exceeded "
             "at a tenth of places and frequencies"
+            f"{'' if median is None else f'; median {median:.2g} %'}"
+            f"{expected.worst and f'; worst {expected.worst}'}"
         )
     if forecast.begins:
         rows["initial state"] = forecast.begins

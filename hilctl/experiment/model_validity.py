@@ -1,6 +1,6 @@
 """Comparison of a reference with the motions that the model was identified on."""
 
-from collections.abc import Iterator, Mapping
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
@@ -12,6 +12,7 @@ from hilctl.models.base import (
     SMALLEST_STROKE,
     HysteresisModel,
     IdentifiedRange,
+    Provenance,
     stroke_class,
 )
 from hilctl.waveforms.build import Reference
@@ -46,6 +47,8 @@ class ExpectedError:
 
     stroke: str  # class of its smallest motion, see :data:`hilctl.models.base.STROKES`
     percent: float  # of the peak-to-peak of that motion
+    median_percent: float | None = None  # None if the model file has none
+    worst: str = ""  # worst motion of the identification, with its error
 
 
 @dataclass(frozen=True, slots=True)
@@ -134,15 +137,20 @@ def range_findings(model: HysteresisModel | None, reference: Reference) -> Range
         )
     if warnings:
         return RangeFindings(warnings=tuple(warnings))
-    return RangeFindings(expected=_expected(known, provenance.errors_by_stroke, reference))
+    return RangeFindings(expected=_expected(known, provenance, reference))
 
 
 def _expected(
-    known: IdentifiedRange, errors: Mapping[str, float], reference: Reference
+    known: IdentifiedRange, provenance: Provenance, reference: Reference
 ) -> ExpectedError | None:
     part = min(_moves_um(reference), default=0.0) / known.peak_to_peak_um[1]
     stroke = stroke_class(part) if part >= SMALLEST_STROKE else ""
-    return ExpectedError(stroke, errors[stroke]) if stroke in errors else None
+    if (percent := provenance.errors_by_stroke.get(stroke)) is None:
+        return None
+    median_percent = provenance.median_by_stroke.get(stroke)
+    return ExpectedError(
+        stroke, percent, median_percent, provenance.worst_by_stroke.get(stroke, "")
+    )
 
 
 def _motion_warnings(known: IdentifiedRange, reference: Reference) -> Iterator[str]:

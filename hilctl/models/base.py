@@ -171,6 +171,9 @@ class Provenance(StrictModel):
         errors_by_stroke: Expected peak error of a motion of each class of :data:`STROKES`, in
             percent of its own peak-to-peak: what 90 % of places and frequencies do not exceed.
             Classes without data are missing.
+        median_by_stroke: The same error of half of the places and frequencies.
+        worst_by_stroke: Peak error of the worst motion of each class, with its record, frequency
+            and middle.
         identified_range: The motions used; None if unknown.
         versions: Software versions, by name.
         created: Date and time in ISO 8601, UTC.
@@ -182,6 +185,8 @@ class Provenance(StrictModel):
     parameters: Mapping[str, float] = Field(default_factory=dict)
     errors_percent: Mapping[str, float] = Field(default_factory=dict)
     errors_by_stroke: Mapping[str, float] = Field(default_factory=dict)
+    median_by_stroke: Mapping[str, float] = Field(default_factory=dict)
+    worst_by_stroke: Mapping[str, str] = Field(default_factory=dict)
     identified_range: IdentifiedRange | None = None
     versions: Mapping[str, str] = Field(default_factory=dict)
     created: str = ""

@@ -3,7 +3,7 @@
 import math
 from collections import defaultdict
 from collections.abc import Iterable, Iterator, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from itertools import chain, pairwise
 from typing import Any, Literal, NamedTuple
 
@@ -50,6 +50,11 @@ class StrokeError:
     worst_percent: float = math.nan  # peak error of the worst motion
     worst: str = ""  # that motion: record, frequency and middle
 
+    @property
+    def worst_motion(self) -> str:
+        """The worst motion, with its peak error."""
+        return f"{self.worst_percent:.2g} % ({self.worst})"
+
 
 @dataclass(frozen=True, kw_only=True)
 class Evaluation:
@@ -59,7 +64,7 @@ class Evaluation:
     modelled_um: tuple[F64, ...]  # of the evaluated samples of each record, float64[n]
     peak_percent: float  # largest error, of the largest peak-to-peak of a record
     rms_percent: float  # root mean square displacement error, in percent of the same
-    own_peak_percent: float  # largest ``peak_percent`` of single records
+    own_peak_percent: float  # largest ``peak_percent`` of single records within the band
     classes: tuple[StrokeError, ...]  # of the model as it is written, the largest strokes first
 
     @property
@@ -85,6 +90,7 @@ def judge(
     *,
     creep: bool = False,
     stroke_um: float | None = None,  # that classes refer to; the largest of the records if None
+    highest_hz: float | None = None,  # of the motions that count; all if None
 ) -> Evaluation:
     """Return the errors of a model on records; loops are in their periodic steady state.
 
@@ -92,7 +98,8 @@ def judge(
     model has neither, so they remain in the errors of motions.
     """
     data = data if isinstance(data, FitData) else FitData(data)
-    return judgement_of(data, responses_um(model, data), stroke_um, creep=creep)
+    responses = responses_um(model, data)
+    return judgement_of(data, responses, stroke_um, creep=creep, highest_hz=highest_hz)
 
 
 def responses_um(model: HysteresisModel, data: FitData) -> F64:
@@ -103,7 +110,12 @@ def responses_um(model: HysteresisModel, data: FitData) -> F64:
 
 
 def judgement_of(
-    data: FitData, responses_um: F64, stroke_um: float | None = None, *, creep: bool = False
+    data: FitData,
+    responses_um: F64,
+    stroke_um: float | None = None,
+    *,
+    creep: bool = False,
+    highest_hz: float | None = None,
 ) -> Evaluation:
     """Return the errors of responses, float64[N], at the evaluated samples of the records."""
     stroke_um = stroke_um or data.stroke_um
@@ -127,14 +139,19 @@ def judgement_of(
     modelled_um = tuple(responses_um[place] for place in data.places)
     parts = zip(data.records, modelled_um, targets_um, strict=True)
     errors = tuple(_loop_error(*part) for part in parts)
+    counted = [
+        error.peak_percent
+        for record, error in zip(data.records, errors, strict=True)
+        if highest_hz is None or isinstance(record, History) or record.frequency_hz <= highest_hz
+    ]
     to_percent = 100.0 / data.stroke_um
     return Evaluation(
         errors=errors,
         modelled_um=modelled_um,
         peak_percent=float(np.max(np.abs(errors_um))) * to_percent,
         rms_percent=float(np.sqrt(np.mean(errors_um**2))) * to_percent,
-        own_peak_percent=max(error.peak_percent for error in errors),
-        classes=stroke_errors(motions, stroke_um),
+        own_peak_percent=max(counted, default=0.0),
+        classes=stroke_errors(motions, stroke_um, highest_hz),
     )
 
 
@@ -214,11 +231,14 @@ def _cut(measured_um: F64, turns: I64, stroke_um: float) -> Iterator[tuple[tuple
             low, high = min(low, lowest), max(high, highest)
 
 
-def stroke_errors(motions: Iterable[MotionError], stroke_um: float) -> tuple[StrokeError, ...]:
-    """Return the error of each class that has motions, see :class:`StrokeError`."""
+def stroke_errors(
+    motions: Iterable[MotionError], stroke_um: float, highest_hz: float | None = None
+) -> tuple[StrokeError, ...]:
+    """Return the error of each class that has motions in the band, see :class:`StrokeError`."""
     by_class: dict[str, list[MotionError]] = {name: [] for name in STROKES}
     for each in motions:
-        by_class[each.stroke].append(each)
+        if highest_hz is None or each.frequency_hz <= highest_hz:
+            by_class[each.stroke].append(each)
     return tuple(_stroke_error(name, found, stroke_um) for name, found in by_class.items() if found)
 
 
@@ -242,10 +262,15 @@ def _stroke_error(name: str, motions: Sequence[MotionError], stroke_um: float) -
 
 
 def largest_errors(*sources: Sequence[StrokeError]) -> tuple[StrokeError, ...]:
-    """Return the largest error of each class."""
+    """Return the largest error of each class, with the worst motion of all sources."""
     errors = sorted(chain(*sources), key=lambda each: each.peak_percent)
     found = {each.label: each for each in errors}
-    return tuple(found[name] for name in STROKES if name in found)
+    worst = {each.label: each for each in sorted(errors, key=lambda each: each.worst_percent)}
+    return tuple(
+        replace(found[name], worst_percent=worst[name].worst_percent, worst=worst[name].worst)
+        for name in STROKES
+        if name in found
+    )
 
 
 def _rate_hz(record: Record) -> float:

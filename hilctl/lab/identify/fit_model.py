@@ -4,6 +4,7 @@ While the command is constant, neither hysteresis nor settled dynamics move the 
 creep is fitted to such rests first and removed from the records, and models are fitted to the rest.
 """
 
+import math
 import time
 from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
@@ -230,8 +231,11 @@ NOT_ZERO_UM = 1e-6
 LEAST = 0.01  # part of a history's power below its lowest frequency
 
 
-def identified_range(data: FitData) -> IdentifiedRange:
-    """Return the range of motions, frequencies and speeds of the records."""
+def identified_range(data: FitData, highest_hz: float | None = None) -> IdentifiedRange:
+    """Return the range of motions, frequencies and speeds of the records.
+
+    Frequencies above ``highest_hz`` are not evaluated, so they are outside of it.
+    """
     moves = [float(np.ptp(data.target_um[place])) for place in data.places]
     speeds = [
         move * float(np.abs(record.rate()).max()) / float(np.ptp(record.command))
@@ -240,7 +244,7 @@ def identified_range(data: FitData) -> IdentifiedRange:
     lowest, highest = zip(*map(frequencies_hz, data.records), strict=True)
     return IdentifiedRange(
         peak_to_peak_um=(min(map(smallest_um, data.records)), max(moves)),
-        frequency_hz=(min(lowest), max(highest)),
+        frequency_hz=(min(lowest), min(max(highest), max(highest_hz or math.inf, min(lowest)))),
         speed_um_per_s=max(speeds),
     )
 
@@ -312,14 +316,20 @@ def fit_model(request: FitRequest) -> FittedModel:
     begin, settings = time.perf_counter(), request.settings
     data = FitData(request.records, request.unit)
     found = fit_kind(request)
-    judged = judge(found.model, data, creep=settings.creep)
+    judged = judge(found.model, data, creep=settings.creep, highest_hz=settings.highest_hz)
+    if not judged.classes:
+        slowest_hz = min(frequencies_hz(record)[0] for record in request.records)
+        raise DataError(
+            f"no motion is as slow as highest_hz={settings.highest_hz:g}: set it above the lowest "
+            f"frequency of the data, {slowest_hz:.3g} Hz"
+        )
     provenance = Provenance(
         source=tuple(request.source),
         method="; ".join(filter(None, (settings.fit.title, settings.changes()))),
         grid=tuple(map(_grid_line, request.records)),
         parameters=found.parameters,
         errors_percent=error_table(judged),
-        identified_range=identified_range(data),
+        identified_range=identified_range(data, settings.highest_hz),
         versions=VERSIONS,
     )
     request.progress(1.0, "done")

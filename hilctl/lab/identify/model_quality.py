@@ -42,7 +42,10 @@ class Verdict:
     def __str__(self) -> str:
         if self.reasons:
             return f"not a model: {'; and '.join(self.reasons)}"
-        errors = ", ".join(f"{each.peak_percent:.2g} % at {each.label}" for each in self.classes)
+        errors = ", ".join(
+            f"{each.peak_percent:.2g} % (median {each.median_percent:.2g} %) at {each.label}"
+            for each in self.classes
+        )
         percent = f"{errors}, of a motion's own peak-to-peak (90 % of places and frequencies)"
         if not self.held_out:
             return f"fit error {percent} (no validation data, so the error elsewhere is unknown)"
@@ -60,9 +63,7 @@ class Verdict:
     @property
     def largest(self) -> str:
         """The largest error of each class, and the motion that has it."""
-        parts = [
-            f"{each.worst_percent:.2g} % at {each.label} ({each.worst})" for each in self.classes
-        ]
+        parts = [f"{each.label} {each.worst_motion}" for each in self.classes]
         return f"largest errors: {', '.join(parts)}"
 
     def to_mapping(self) -> dict[str, Any]:

@@ -132,7 +132,10 @@ def _together(
     how = f"{len(held_out)} of {len(request.records)} {parts}, held out in turn"
     stroke_um = FitData(request.records).stroke_um
     data, creep = FitData(held_out, request.unit), request.settings.creep
-    judgement = judgement_of(data, modelled_um, stroke_um, creep=creep)
+    highest_hz = request.settings.highest_hz
+    judgement = judgement_of(data, modelled_um, stroke_um, creep=creep, highest_hz=highest_hz)
+    if not judgement.classes:
+        return None
     return HeldOut(judgement, held_out, how, done[-1][2])
 
 
@@ -351,7 +354,7 @@ def _candidates(
     candidates: Sequence[Mapping[str, Any]],
     starts: Sequence[object | None] = (),
 ) -> list[_Tried]:
-    shared: dict[str, Any] = {"whole": given.whole, "table": given.table, "points": given.points}
+    shared = {name: getattr(given, name) for name in ("whole", "table", "points", "highest_hz")}
     names = [", ".join(f"{key} {value}" for key, value in each.items()) for each in candidates]
     request.progress(0.0, "; ".join(names))
     settings = [IdentifySettings(**each, **shared) for each in candidates]

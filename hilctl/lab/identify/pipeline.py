@@ -133,8 +133,13 @@ def identify_records(request: FitRequest) -> Identification:
     best, cost = _at_bound(request, with_modes(records, found))
     fit, held_out, selection = best.fit, best.held_out, best.selection
     if validate:
-        stroke_um = FitData(records).stroke_um
-        others = judge(fit.model, validate, creep=request.settings.creep, stroke_um=stroke_um)
+        others = judge(
+            fit.model,
+            validate,
+            creep=request.settings.creep,
+            stroke_um=FitData(records).stroke_um,
+            highest_hz=request.settings.highest_hz,
+        )
         how = "files that were not fitted"
         if held_out is not None and held_out.records[0] is validate[0]:
             how += ", but selected the kind of model"
@@ -190,9 +195,12 @@ def as_recorded(found: Identification, request: FitRequest, lag_samples: int) ->
     """
     if found.verdict.grade == "not a model" or not lag_samples:
         return found
-    stroke_um, model = FitData(request.records).stroke_um, found.fit.model
-    parts = [each for each in (request.records, request.validate) if each]
-    classes = largest_errors(*(judge(model, each, stroke_um=stroke_um).classes for each in parts))
+    stroke_um, highest_hz = FitData(request.records).stroke_um, request.settings.highest_hz
+    classes = largest_errors(*(
+        judge(found.fit.model, each, stroke_um=stroke_um, highest_hz=highest_hz).classes
+        for each in (request.records, request.validate)
+        if each
+    ))  # fmt: skip
     note = (
         f"the model has no lag, and the displacement lags by {lag_samples} samples: if the "
         f"recording delays it, set table.lag_samples={lag_samples}; otherwise use --model staged"
@@ -204,8 +212,13 @@ def as_recorded(found: Identification, request: FitRequest, lag_samples: int) ->
 
 def with_verdict(found: Identification, verdict: Verdict) -> Identification:
     """Return an identification with a verdict, whose errors by stroke its model has."""
-    errors = {each.label: each.peak_percent for each in verdict.classes}
-    fit = _with_provenance(found.fit, {"errors_by_stroke": errors})
+    classes = verdict.classes
+    errors = {
+        "errors_by_stroke": {each.label: each.peak_percent for each in classes},
+        "median_by_stroke": {each.label: each.median_percent for each in classes},
+        "worst_by_stroke": {each.label: each.worst_motion for each in classes},
+    }
+    fit = _with_provenance(found.fit, errors)
     return replace(found, fit=fit, verdict=verdict)
 
 

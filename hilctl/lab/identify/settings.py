@@ -20,7 +20,7 @@ from hilctl.models.kinds import FITS, known
 
 Choices: TypeAlias = Mapping[str, Any]
 NO_CHOICES: Choices = {}
-_COMMON = {"kind", "points", "own"}
+_COMMON = {"kind", "points", "highest_hz", "own"}
 """Settings of all kinds of model."""
 
 
@@ -73,6 +73,9 @@ class FitSettings(StrictModel):
     magnets: bool = _setting(True, "Fit a bias field at zero command.")
     starts: int = _setting(6, "Starting points of the search.", ge=1, le=1000)
     points: int = _setting(300, "Points per loop.", ge=16, le=100_000)
+    highest_hz: float | None = _setting(
+        None, "Highest frequency of use: faster motions are fitted, not evaluated.", gt=0.0
+    )
     own: Any = Field(None, description="Settings of the kind's own.", validate_default=True)
 
     @property

@@ -254,7 +254,10 @@ def _model(recording: Recording) -> Iterator[tuple[str, str]]:
 
 
 def model_error(model: HysteresisModel) -> str:
-    """Return the error of a model, on data outside the fit if known."""
+    """Return the error of a model by stroke, or that of whole records if unknown."""
+    if by_stroke := model.provenance.errors_by_stroke:
+        parts = [f"{quantity(percent, '%')} at {stroke}" for stroke, percent in by_stroke.items()]
+        return f"{', '.join(parts)}; exceeded at a tenth of places and frequencies"
     errors = model.provenance.errors_percent
     for prefix, of in (("held_out_", "on held-out data"),
                        ("", "on the data of the fit (no validation data)")):  # fmt: skip

@@ -15,11 +15,11 @@ KNOWN = IdentifiedRange(
 )
 
 
-def findings(values_um, frequency_hz=0.0):
+def findings(values_um, frequency_hz=0.0, **more):
     period = RATE_HZ / frequency_hz if frequency_hz else 0.0
     segment = Segment("s", 0, values_um.size, 0, values_um.size, period)
     span = float(values_um.min()), float(values_um.max())
-    provenance = Provenance(identified_range=KNOWN, errors_by_stroke={"half stroke": 1.5})
+    provenance = Provenance(identified_range=KNOWN, errors_by_stroke={"half stroke": 1.5}, **more)
     model = terfenol_rdpi().model_copy(update={"provenance": provenance})
     return range_findings(model, Reference(values_um, "um", RATE_HZ, (segment,), span))
 
@@ -46,6 +46,14 @@ def test_within_the_range_there_is_nothing_to_say(frequency_hz):
 def test_expected_error_is_that_of_the_stroke_within_the_range(amplitude, frequency_hz, percent):
     found = findings(sine(frequency_hz, amplitude), frequency_hz).expected
     assert (found and found.percent) == percent
+
+
+def test_expected_error_has_the_median_and_the_worst_motion_of_the_model_file():
+    more = {"median_by_stroke": {"half stroke": 0.7}, "worst_by_stroke": {"half stroke": "4 %"}}
+    found = findings(sine(50.0, 20.0), 50.0, **more).expected
+    assert (found.percent, found.median_percent, found.worst) == (1.5, 0.7, "4 %")
+    older = findings(sine(50.0, 20.0), 50.0).expected
+    assert (older.percent, older.median_percent, older.worst) == (1.5, None, "")
 
 
 def test_somewhat_faster_is_warned_and_much_faster_refused():

@@ -5,6 +5,7 @@ from dataclasses import replace
 import numpy as np
 import pytest
 
+from hilctl.base.errors import DataError
 from hilctl.lab.identify import pipeline
 from hilctl.lab.identify.data.records import History
 from hilctl.lab.identify.fit_api import FitRequest
@@ -43,6 +44,27 @@ def test_a_model_that_holds_on_what_it_did_not_see_is_good(grid):
     by_stroke = found.fit.model.provenance.errors_by_stroke
     assert by_stroke == {each.label: each.peak_percent for each in found.verdict.classes}
     assert found.verdict.within_percent == max(by_stroke.values())
+    provenance = found.fit.model.provenance
+    for each in found.verdict.classes:
+        assert provenance.median_by_stroke[each.label] == each.median_percent <= each.peak_percent
+        assert each.worst in provenance.worst_by_stroke[each.label]
+
+
+def test_motions_above_the_highest_frequency_of_use_do_not_count(grid):
+    """A loop at 100 Hz may be far off in a model for up to 50 Hz."""
+    far = [
+        replace(each, displacement_um=2.0 * each.displacement_um)
+        if each.frequency_hz == 100.0
+        else each
+        for each in grid
+    ]
+    assert judged(far, grid).verdict.grade in {"poor", "not a model"}
+    found = judged([*grid[0::3], *grid[1::3]], far, highest_hz=50.0)
+    assert found.verdict.grade == "good"
+    assert found.fit.model.provenance.identified_range.frequency_hz == (10.0, 50.0)
+    assert judged(grid, highest_hz=70.0).fit.model.provenance.identified_range.frequency_hz[1] == 70
+    with pytest.raises(DataError, match="highest_hz=5"):
+        judged(grid, highest_hz=5.0)
 
 
 def test_an_error_on_what_was_not_fitted_decides(grid):

@@ -25,7 +25,7 @@ def found(held_out=None, lag_samples=0, starts=(), at_bound=(), known=None):
         parameters={"a_0": 4.0, "tau_s": 1e-4}, standard_errors={"tau_s": 2e-6}, at_bound=at_bound,
         model=SimpleNamespace(provenance=Provenance(identified_range=known)),
     )  # fmt: skip
-    classes = (StrokeError("full stroke", 4.0, 1.0, 1),)
+    classes = (StrokeError("full stroke", 4.0, 1.0, 1, median_percent=2.0),)
     verdict = Verdict("usable", 4.0, held_out is not None, notes=("one note",), classes=classes)
     return SimpleNamespace(
         fit=fit,
@@ -62,7 +62,7 @@ def test_starts_that_ended_apart_are_shown_by_their_spread():
 def test_what_was_not_fitted_comes_before_what_was():
     judgement = SimpleNamespace(peak_percent=3.0, rms_percent=1.0, own_peak_percent=5.0)
     lines = summary(found(SimpleNamespace(judgement=judgement, how="others"), lag_samples=2))
-    assert lines[0].startswith("usable within 4 % at full stroke")
+    assert lines[0].startswith("usable within 4 % (median 2 %) at full stroke")
     assert lines[2] == "one note"
     assert lines[3].startswith("not fitted: peak error 3.00 %")
     assert lines[4].startswith("fitted: peak error 2.50 %")
