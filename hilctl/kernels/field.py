@@ -9,6 +9,9 @@ With thermal activation a play F does not follow immediately: while u leads it b
 = a exp((d - r) / k). Therefore loops widen with the logarithm of the rate, and at constant u the
 output creeps with the logarithm of time. A play of threshold 0 does not creep.
 
+With accommodation a play within its threshold relaxes to u while u moves away from it, dF/d|u| = (u
+- F) / L. Therefore small loops drift over the cycles.
+
 A *drag* of length k relaxes to the position s_u of u in a cell while u moves towards it:
 ds/d|u| = (s_u - s) / k, otherwise ds = 0. Unlike minor loops of plays, minor loops of drags creep.
 A sample updates all cells of a drag but only one entry of a play's table, so drags have their own
@@ -43,8 +46,9 @@ from hilctl.kernels.jit import kernel
 
 Bank: TypeAlias = tuple[F64, F64, F64, F64, F64]
 """Thresholds float64[p], lengths float64[d], tables of the plays at the edges of n cells, float64[
-p (n + 1)], weights of the drags in c cells, float64[d c], and the grid, float64[7]: lowest edge,
-width and n for the plays, width and c for the drags; k and a T / k of the creep of the plays."""
+p (n + 1)], weights of the drags in c cells, float64[d c], and the grid, float64[8]: lowest edge,
+width and n for the plays, width and c for the drags; k and a T / k of the creep of the plays; L of
+their accommodation, or 0."""
 Span: TypeAlias = tuple[float, float, float]
 Losses: TypeAlias = tuple[float, float, float, float, float, float, float, float, float, float]
 """tau_0 / T, tau_1 / T, decay factor of z per sample, b, c, x, g, e_0, the weight of z before a
@@ -203,6 +207,27 @@ def _even(change: float, creep: float) -> tuple[float, float, float, float]:
 
 
 @kernel(inline=True)
+def _fade(last: float, u: float, length: float) -> Span:
+    """Return the field before, L, and the lost part of a distance: common to all plays."""
+    return last, length, _gone(abs(u - last) / length) if length > 0.0 else 0.0
+
+
+@kernel(inline=True)
+def _accommodated(held: float, u: float, fade: Span) -> tuple[float, float, float]:
+    """Return a play without its threshold, its slope by u, and the remaining part of ``held``."""
+    last, length, gone = fade
+    side = 1.0 if u >= last else -1.0
+    if not length > 0.0 or not side * (u - held) > 0.0:
+        return held, 0.0, 1.0
+    way, behind = abs(u - last), side * (last - held)
+    if behind < 0.0:  # the field passes the play
+        way, behind = side * (u - held), 0.0
+        gone = _gone(way / length)
+    lost = (length - behind) * gone
+    return held + side * (way - lost), (behind + lost) / length, 1.0 - gone
+
+
+@kernel(inline=True)
 def _play(
     held: float,
     u: float,
@@ -210,23 +235,25 @@ def _play(
     creep: float,
     pace: float,
     even: tuple[float, float, float, float],
-) -> tuple[float, float, float]:
-    """Return a play after a linear change of u, its slope by u, and the remaining part of ``held``.
+    fade: Span,
+) -> tuple[float, float, float, float]:
+    """Return a play after a linear change of u, and its slope by u.
 
-    ``creep`` is k, ``pace`` is a t / k for the time t of the change. While d changes at a rate R,
-    p = F' / k obeys p' = p (R / k - p).
+    The last two results are the remaining part of ``held``, and the slope by the threshold against
+    the motion. ``creep`` is k, ``pace`` is a t / k for the time t of the change. While d changes at
+    a rate R, p = F' / k obeys p' = p (R / k - p).
     """
-    now = max(min(held, u + threshold), u - threshold)
     if not creep > 0.0 or threshold == 0.0:
-        moved = 0.0 if now == held else 1.0
-        return now, moved, 1.0 - moved
+        free, slope, kept = _accommodated(held, u, fade)
+        now = max(min(free, u + threshold), u - threshold)
+        return (now, slope, kept, 0.0) if now == free else (now, 1.0, 0.0, 1.0)
     side = 1.0 if u > held else -1.0
     way = side * even[0]
     furthest = side * (u - held)
     ahead = (furthest - threshold) / creep - way
     most = ahead + max(way, 0.0)
     if most < _STILL or pace == 0.0:
-        return held, 0.0, 1.0
+        return held, 0.0, 1.0, 0.0
     if most > _SURE or way > _SURE:
         moved = max(most - math.log(max(abs(way), 1.0)) + math.log(pace), 0.0)
         part = 1.0 if moved > 0.0 else 0.0
@@ -235,9 +262,9 @@ def _play(
         part = power / (1.0 + power)
         moved = math.log1p(power) if power > 1e-4 else power * (1.0 - power * (0.5 - power / 3.0))
     if creep * moved > furthest:
-        return u, 1.0, 0.0
+        return u, 1.0, 0.0, 1.0
     by_way = even[3] if way > 0.0 else 1.0 - even[3]
-    return held + side * creep * moved, part * by_way, 1.0 - part
+    return held + side * creep * moved, part * by_way, 1.0 - part, part
 
 
 @kernel(nogil=True)
@@ -247,24 +274,26 @@ def play_paths(
     thresholds: F64,
     creep: float,
     rate: float,
+    length: float,
     rows: I64,
     out: F64_2D,
     by: F64_2D,
 ) -> None:
     """Compute plays from rest along a path, and their slopes by the thresholds: float64[p, N] each.
 
-    ``step_s``, float64[n], is the time of each step of ``u``, ``creep`` k and ``rate`` a / k;
-    ``rows`` is int64[N], the points that are filled in, rising.
+    ``step_s``, float64[n], is the time of each step of ``u``, ``creep`` k, ``rate`` a / k and
+    ``length`` L; ``rows`` is int64[N], the points that are filled in, rising.
     """
     held, slopes = np.zeros(thresholds.size), np.zeros(thresholds.size)
     last, row = 0.0, 0
     for k in range(u.size):
-        even = _even(u[k] - last, creep)
+        even, fade = _even(u[k] - last, creep), _fade(last, u[k], length)
         last = u[k]
         is_row = row < rows.size and rows[row] == k
         for i in range(thresholds.size):
-            now, _, kept = _play(held[i], u[k], thresholds[i], creep, rate * step_s[k], even)
-            slope = kept * slopes[i] - (1.0 - kept) * (1.0 if u[k] > held[i] else -1.0)
+            pace = rate * step_s[k]
+            now, _, kept, pushed = _play(held[i], u[k], thresholds[i], creep, pace, even, fade)
+            slope = kept * slopes[i] - pushed * (1.0 if u[k] > held[i] else -1.0)
             held[i], slopes[i] = now, 0.0 if now == u[k] else slope
             if is_row:
                 out[i, row], by[i, row] = held[i], slopes[i]
@@ -279,9 +308,9 @@ def _peek(u: float, memory: F64, bank: Bank) -> tuple[float, float]:
     stride, plays = int(cells) + 1, thresholds.size
     last = memory[memory.size - 6]
     total = slope = 0.0
-    even = _even(u - last, grid[5])
+    even, fade = _even(u - last, grid[5]), _fade(last, u, grid[7])
     for i in range(plays):
-        held, by_u, _ = _play(memory[i], u, thresholds[i], grid[5], grid[6], even)
+        held, by_u, _, _ = _play(memory[i], u, thresholds[i], grid[5], grid[6], even, fade)
         place = (held - low) * per_cell
         j = i * stride + _cell(place, cells)
         rise = values[j + 1] - values[j]
@@ -300,9 +329,9 @@ def _settle(u: float, memory: F64, bank: Bank) -> None:
     """Move all operators to an effective field."""
     thresholds, lengths, grid = bank[0], bank[1], bank[4]
     last = memory[memory.size - 6]
-    even = _even(u - last, grid[5])
+    even, fade = _even(u - last, grid[5]), _fade(last, u, grid[7])
     for i in range(thresholds.size):
-        memory[i] = _play(memory[i], u, thresholds[i], grid[5], grid[6], even)[0]
+        memory[i] = _play(memory[i], u, thresholds[i], grid[5], grid[6], even, fade)[0]
     for i in range(lengths.size):
         _move_drag(u, last, i, memory, bank)
     memory[memory.size - 6] = u

@@ -148,6 +148,8 @@ class FieldModel(HysteresisModel):
         curve: From the operators' output to displacement.
         losses: Lead of the command.
         activation: Creep of the plays, or None.
+        accommodation: Per input unit; part of its distance to u that a play loses per travel of u
+            away from it. Only without activation.
     """
 
     STANDALONE = False
@@ -162,6 +164,7 @@ class FieldModel(HysteresisModel):
     curve: OutputCurve
     losses: FieldLosses = FieldLosses()
     activation: ThermalActivation | None = None
+    accommodation: NotNegative = 0.0
 
     def _problems(self) -> Iterator[str]:
         plays, drags = self._lines()
@@ -170,6 +173,8 @@ class FieldModel(HysteresisModel):
         yield from table_problems(drags)
         if any(not length > 0.0 for length in self.lengths):
             yield f"lengths must be > 0: {list(self.lengths)}"
+        if self.activation is not None and self.accommodation:
+            yield f"accommodation must be 0 with activation: {self.accommodation!r}"
         if len(self.slopes) != len(self.thresholds) + len(self.lengths):
             yield (
                 f"slopes must have one line per threshold and per length: {len(self.slopes)} for "
@@ -199,7 +204,9 @@ class FieldModel(HysteresisModel):
         if self.activation is not None:
             width = self.activation.width
             creep = width, self.activation.rate / (width * sample_rate_hz)
-        grid = np.array([self.lowest, self.cell, cells, self.cell * (cells / wide), wide, *creep])
+        length = 1.0 / self.accommodation if self.accommodation else 0.0
+        widths = self.lowest, self.cell, cells, self.cell * (cells / wide), wide
+        grid = np.array([*widths, *creep, length])
         lengths = np.array(self.lengths, dtype=np.float64)
         return np.array(self.thresholds), lengths, values.ravel(), drags.ravel(), grid
 

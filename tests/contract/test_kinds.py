@@ -61,6 +61,7 @@ CASES = {
                       settings=SMALL),
     "drags": KindCase(StagedModel.around(field_model())),
     "plays that creep": KindCase(StagedModel.around(field_model(activation=ACTIVATION))),
+    "plays that accommodate": KindCase(StagedModel.around(field_model(accommodation=0.2))),
     "generalised_duhem": KindCase(StagedModel.around(duhem_model()), fit="generalised_duhem",
                                   settings={"cells": 12, "across": 8}),
     "refined": KindCase(refined(PPI, residual(), 0.4), 40.0),

@@ -213,10 +213,12 @@ WHOLE: tuple[Mapping[str, Any], ...] = (
 """Candidates for histories: a small model of each kind, which is identified quickly."""
 CREEPING: Mapping[str, Any] = {**WHOLE[0], "activation": True}
 """Further candidate for histories whose rests show creep."""
+ACCOMMODATING: Mapping[str, Any] = {**WHOLE[0], "accommodation": True}
+"""Further candidate for histories if the error of all others is large."""
 RIGID: Mapping[str, Any] = {**WHOLE[0], "structure": False, "modes": False}
 """Further candidate for histories of one amplitude or frequency, if no structure was measured."""
 INTEGRATED: Mapping[str, Any] = {"kind": "integrated", "offset": True}
-"""Further candidate for histories if the error of all others is large."""
+"""The same."""
 WELL_PERCENT = 0.6  # mean error by stroke that small models of the right kind reach
 IN_FULL = {"field", "generalised_duhem"}
 """Kinds with a larger candidate, of their default size, if their small model has a small error."""
@@ -267,7 +269,7 @@ def _choose_kind(request: FitRequest, given: IdentifySettings) -> Selection:
         candidates.append(CREEPING)
     errors = _candidates(request, given, candidates)
     if whole and not any(each.stroke_percent < WELL_PERCENT for each in errors):
-        errors += _candidates(request, given, (INTEGRATED,))
+        errors += _candidates(request, given, (INTEGRATED, ACCOMMODATING))
     if not errors:
         raise DataError(f"too few data to select a kind of model: {_undivided(request.records)}")
     worth = CLEAR if alike else WORTH
@@ -311,6 +313,8 @@ def _in_full(tried: "_Tried") -> dict[str, Any]:
     if settings.looks_for("activation"):
         # Each of the plays that creep costs as much per sample as eight that do not.
         chosen |= {"activation": True, "plays": 16}
+    if settings.looks_for("accommodation"):
+        chosen |= {"accommodation": True}
     if not settings.looks_for("structure"):
         chosen |= {"structure": False, "modes": False}
     return chosen

@@ -52,6 +52,7 @@ class FitSettings(StrictModel):
     )
     across: int = _setting(20, "Cells of a table of slopes across its band.", ge=2, le=60)
     activation: bool = _setting(False, "Plays creep with the logarithm of time.")
+    accommodation: bool = _setting(False, "Plays forget with the travel of the field.")
     knots: int = _setting(24, "Pieces of the output curve.", ge=2, le=60)
     weights: Literal["exponential", "free"] = _setting(
         "exponential", "Weights a e^(-b i) (3.26, 6.19-6.23), or each weight by itself."

@@ -27,10 +27,10 @@ BANK = (
     LENGTHS,
     (VALUES - VALUES[:, [2]]).ravel(),  # the third edge is at 0
     DRAGS.ravel(),
-    np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS, 0.0, 0.0]),
+    np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS, 0.0, 0.0, 0.0]),
 )
 CREEP, PACE = 0.3, 0.5
-CREEPING = (*BANK[:-1], np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS, CREEP, PACE]))
+CREEPING = (*BANK[:-1], np.array([LOWEST, WIDTH, CELLS, WIDTH, CELLS, CREEP, PACE, 0.0]))
 SPAN = (-12.0, 12.0, 1e-10)
 LOSSES = (3.0, 0.4, 0.6, 0.1, 0.02, 0.05, 0.2, 0.01, -0.4 / math.log(0.6), 0.55)
 NO_LOSSES = (0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 1.0, 0.0, 1.0)
@@ -41,7 +41,7 @@ LINE = (  # one play without a threshold, of slope 2
     np.zeros(0),
     np.array([-8.0, 8.0]),
     np.zeros(0),
-    np.array([-4.0, 8.0, 1.0, 8.0, 1.0, 0.0, 0.0]),
+    np.array([-4.0, 8.0, 1.0, 8.0, 1.0, 0.0, 0.0, 0.0]),
 )
 
 
@@ -116,10 +116,10 @@ def test_model_and_inverse_are_the_equations(coupling, losses):
     np.testing.assert_allclose(run(field_inverse, y, **given), command, atol=1e-7)
 
 
-def play_along(u, threshold=0.8, creep=CREEP, pace=PACE):
+def play_along(u, threshold=0.8, creep=CREEP, pace=PACE, length=0.0):
     out, by = np.empty((2, 1, u.size))
     rows = np.arange(u.size)
-    play_paths(u, np.ones(u.size), np.array([threshold]), creep, pace, rows, out, by)
+    play_paths(u, np.ones(u.size), np.array([threshold]), creep, pace, length, rows, out, by)
     return out[0], by[0]
 
 
@@ -144,11 +144,37 @@ def test_a_play_creeps_with_the_logarithm_of_time_towards_the_static_one():
     assert play_along(path(), creep=1e-3, pace=1.0)[0] == pytest.approx(static, abs=0.02)
 
 
-@pytest.mark.parametrize("creep", [0.0, CREEP])
-def test_the_slope_of_a_play_by_its_threshold(creep):
+def test_a_play_that_accommodates_follows_its_equation():
+    u = path()
+    held, last, expected = 0.0, 0.0, []
+    for now in u:
+        for part in np.linspace(last, now, 101)[1:]:
+            if (now - last) * (part - held) > 0.0:
+                held += (part - held) * abs(now - last) / 100.0 / 5.0
+            held = min(max(held, part - 0.8), part + 0.8)
+        last = now
+        expected.append(held)
+    assert play_along(u, creep=0.0, length=5.0)[0] == pytest.approx(np.array(expected), abs=2e-3)
+
+
+def test_small_loops_accommodate():
+    """They move a play to their middle, within its threshold; whole paths are exact."""
+    u = np.concatenate((np.linspace(0.0, 3.0, 50), 2.0 + np.cos(np.arange(5000) / 10.0)))
+    held = play_along(u, 2.0, creep=0.0, length=20.0)[0]
+    assert held[49] == pytest.approx(1.0, abs=0.1)
+    assert held[-1000:].mean() == pytest.approx(2.0, abs=0.05)
+    coarse = play_along(np.array([3.0, 1.0, 2.5]), 2.0, creep=0.0, length=20.0)[0]
+    turns = [np.linspace(a, b, 30) for a, b in ((0.0, 3.0), (3.0, 1.0), (1.0, 2.5))]
+    fine = play_along(np.concatenate(turns), 2.0, creep=0.0, length=20.0)[0]
+    assert fine[29::30] == pytest.approx(coarse, abs=1e-12)
+
+
+@pytest.mark.parametrize(("creep", "length"), [(0.0, 0.0), (CREEP, 0.0), (0.0, 5.0)])
+def test_the_slope_of_a_play_by_its_threshold(creep, length):
     u = np.ascontiguousarray(path()[::7])
-    change = (play_along(u, 0.8 + 1e-6, creep)[0] - play_along(u, 0.8 - 1e-6, creep)[0]) / 2e-6
-    assert play_along(u, creep=creep)[1] == pytest.approx(change, abs=1e-4)
+    low, high = (play_along(u, 0.8 + d, creep, length=length)[0] for d in (-1e-6, 1e-6))
+    by = play_along(u, creep=creep, length=length)[1]
+    assert by == pytest.approx((high - low) / 2e-6, abs=1e-4)
 
 
 def test_the_inverse_undoes_plays_that_creep():

@@ -52,10 +52,10 @@ def reference_um(seed):
     return np.ascontiguousarray(9.0 * np.minimum(t / 0.02, 1.0) * sines)
 
 
-@pytest.mark.parametrize("activation", [None, ACTIVATION])
+@pytest.mark.parametrize("relaxing", [{}, {"activation": ACTIVATION}, {"accommodation": 0.2}])
 @pytest.mark.parametrize("coupling", [-0.03, 0.0, 0.03])
-def test_inverse_undoes_the_model(coupling, activation):
-    model = field_model(coupling=coupling, activation=activation)
+def test_inverse_undoes_the_model(coupling, relaxing):
+    model = field_model(coupling=coupling, **relaxing)
     wanted_um = reference_um(1)
     command = model.inverse(RATE_HZ).process(wanted_um)
     assert model.forward(RATE_HZ).process(command) == pytest.approx(wanted_um, abs=1e-4)
@@ -105,6 +105,7 @@ def test_a_loop_is_the_narrower_the_slower_it_is():
     ({"thresholds": (1.0, 2.0)}, "first threshold must be 0"),
     ({"thresholds": (0.0, 0.0)}, "thresholds must rise"),
     ({"lengths": (0.0,)}, "lengths must be > 0"),
+    ({"activation": ACTIVATION, "accommodation": 0.1}, "accommodation must be 0"),
     ({"lengths": ()}, "per threshold and per length"),
     ({"cell": 0.0}, "cell must be > 0"),
     ({"slopes": ((1.0, 0.0), (1.0, 1.0), (1.0, 1.0))}, "first line must be > 0"),

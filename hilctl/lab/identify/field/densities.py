@@ -48,12 +48,13 @@ class Grid:
 
 
 @dataclass(frozen=True, slots=True)
-class Creep:
-    """Thermal activation of the plays, see :class:`~hilctl.models.effective_field.FieldModel`."""
+class Relaxation:
+    """Relaxation of the plays, see :class:`~hilctl.models.effective_field.FieldModel`."""
 
-    width: float
-    rate: float
     steps_s: Sequence[F64]  # time of each step of each path
+    width: float = 0.0  # of the thermal activation; 0 without
+    rate: float = 0.0
+    length: float = 0.0  # of the accommodation; 0 without
 
 
 @dataclass(frozen=True, slots=True)
@@ -88,13 +89,15 @@ class Weights:
         return np.asarray(given - curve.operators_of(y) - noise)
 
 
-def table(paths: Sequence[F64], kept: Sequence[I64], grid: Grid, creep: Creep | None = None) -> F64:
+def table(
+    paths: Sequence[F64], kept: Sequence[I64], grid: Grid, relaxation: Relaxation | None = None
+) -> F64:
     """Return each play's output per spline at the kept samples: float64[N, plays splines]."""
     parts: list[F64] = []
     for k, (path, samples) in enumerate(zip(paths, kept, strict=True)):
         u, rows = _needed(path, samples)
         out = np.empty((rows.size, grid.plays * grid.splines))
-        held, _ = _plays(k, (path, samples), (u, rows), grid, creep)
+        held, _ = _plays(k, (path, samples), (u, rows), grid, relaxation)
         play_columns(held, grid.lowest, grid.piece, grid.splines, out)
         parts.append(out)
     return np.concatenate(parts)
@@ -107,15 +110,22 @@ def _needed(path: F64, samples: I64) -> tuple[F64, I64]:
 
 
 def _plays(
-    k: int, whole: tuple[F64, I64], needed: tuple[F64, I64], grid: Grid, creep: Creep | None
+    k: int,
+    whole: tuple[F64, I64],
+    needed: tuple[F64, I64],
+    grid: Grid,
+    relaxation: Relaxation | None,
 ) -> tuple[F64, F64]:
     """Return the positions of plays at the kept samples, and their slopes by the thresholds."""
-    # Plays that creep depend on the time of each point.
-    u, rows = needed if creep is None else whole
-    steps_s = np.zeros(u.size) if creep is None else creep.steps_s[k]
-    width, rate = (0.0, 0.0) if creep is None else (creep.width, creep.rate / creep.width)
+    u, rows = needed
+    steps_s, width, rate, length = np.zeros(u.size), 0.0, 0.0, 0.0
+    if relaxation is not None:
+        width, length = relaxation.width, relaxation.length
+    if relaxation is not None and width > 0.0:
+        # Plays that creep depend on the time of each point.
+        (u, rows), steps_s, rate = whole, relaxation.steps_s[k], relaxation.rate / width
     held, by = np.empty((2, grid.thresholds.size, rows.size))
-    play_paths(u, steps_s, grid.thresholds, width, rate, rows, held, by)
+    play_paths(u, steps_s, grid.thresholds, width, rate, length, rows, held, by)
     return held, by
 
 
@@ -124,7 +134,7 @@ def outputs(
     kept: Sequence[I64],
     grid: Grid,
     slopes: F64,
-    creep: Creep | None = None,
+    relaxation: Relaxation | None = None,
 ) -> tuple[F64, F64]:
     """Return the output of weighted operators and its slopes by thresholds: float64[N, p - 1]."""
     given: list[F64] = []
@@ -132,7 +142,7 @@ def outputs(
     for k, (path, samples) in enumerate(zip(paths, kept, strict=True)):
         u, rows = _needed(path, samples)
         total, by = np.empty(rows.size), np.empty((rows.size, grid.plays))
-        held, change = _plays(k, (path, samples), (u, rows), grid, creep)
+        held, change = _plays(k, (path, samples), (u, rows), grid, relaxation)
         plays_given(held, change, grid.lowest, grid.piece, slopes, total, by)
         given.append(total)
         changes.append(by[:, 1:])

@@ -7,10 +7,10 @@ import numpy as np
 
 from hilctl.base.types import F64, I64
 from hilctl.lab.identify.field.densities import (
-    Creep,
     Curve,
     Equations,
     Grid,
+    Relaxation,
     Weights,
     outputs,
     table,
@@ -51,7 +51,7 @@ class BareSignal:
     y: F64
     noise: F64
     scale: F64
-    creep: Creep | None = None
+    relaxation: Relaxation | None = None
 
 
 class JointRefinement:
@@ -94,7 +94,7 @@ class JointRefinement:
         """Return the equations of a point; those of the last point are cached."""
         if self._tried is None or not np.array_equal(self._tried[0], x):
             rows, grid = self._rows_of(x[:STAGES]), self._laid(x)
-            columns = table(rows.fields, self._paths, grid, rows.creep)
+            columns = table(rows.fields, self._paths, grid, rows.relaxation)
             equations = Equations(columns, rows.y, rows.noise, grid, self._least, rows.scale)
             self._tried = x.copy(), equations, rows
         return self._tried[1:]
@@ -104,7 +104,7 @@ class JointRefinement:
         grid, found = self._laid(x), equations.solve()
         changes = np.empty((rows.y.size, x.size))
         given, changes[:, STAGES:] = outputs(
-            rows.fields, self._paths, grid, found.slopes, rows.creep
+            rows.fields, self._paths, grid, found.slopes, rows.relaxation
         )
         here = found.errors_of(given, rows.y, rows.noise)
         for i in range(STAGES):
@@ -114,7 +114,7 @@ class JointRefinement:
             there = x.copy()
             there[i] += TRIED * unit[i] if x[i] + TRIED * unit[i] <= high[i] else -TRIED * unit[i]
             moved = self._rows_of(there[:STAGES])
-            given, _ = outputs(moved.fields, self._paths, grid, found.slopes, moved.creep)
+            given, _ = outputs(moved.fields, self._paths, grid, found.slopes, moved.relaxation)
             errors = found.errors_of(given, moved.y, moved.noise)
             changes[:, i] = (errors * moved.scale / rows.scale - here) / (there[i] - x[i])
         return equations.place(here, changes)
@@ -177,9 +177,12 @@ class FieldSearch:
         structure: Structure = True,
         *,
         activation: bool = False,
+        accommodation: bool = False,
     ) -> None:
         self._data, self._size, self._least = data, size, least
-        self._space = StageSpace.of(data, structure, activation=activation)
+        self._space = StageSpace.of(
+            data, structure, activation=activation, accommodation=accommodation
+        )
         self._measured = structure is not True
         self._choose(SEARCH_ROWS)
         self._curve: Curve | None = None
@@ -231,7 +234,7 @@ class FieldSearch:
 
     def _solved(self, x: F64) -> Weights:
         bare, grid = self._bare(x), self._laid()
-        columns = table(bare.fields, self._rows.samples, grid, bare.creep)
+        columns = table(bare.fields, self._rows.samples, grid, bare.relaxation)
         return Equations(columns, bare.y, bare.noise, grid, self._least, bare.scale).solve()
 
     def _bare(self, x: F64) -> BareSignal:
@@ -244,9 +247,13 @@ class FieldSearch:
         # Otherwise a delay of half a sample would fit best, because it averages noise.
         gains = [run.noise_gain(known.delay_s) for run in runs]
         scale /= np.repeat(gains, [at.size for at in self._rows.samples])
-        plays, steps_s = known.activation, [run.step_s for run in runs]
-        creep = None if plays is None else Creep(plays.width, plays.rate, steps_s)
-        return BareSignal(fields, y, noise, scale, creep)
+        relaxation = Relaxation([run.step_s for run in runs])
+        if known.activation is not None:
+            width, rate = known.activation.width, known.activation.rate
+            relaxation = replace(relaxation, width=width, rate=rate)
+        if known.accommodation > 0.0:
+            relaxation = replace(relaxation, length=1.0 / known.accommodation)
+        return BareSignal(fields, y, noise, scale, relaxation)
 
     def _signals(self, x: F64) -> tuple[list[F64], list[F64]]:
         known = physical(stages_in(x), self._data)
@@ -324,7 +331,14 @@ def fit_field(job: FitJob) -> FoundModel:
     settings = job.settings
     data = Prepared(histories_of(job.data.records, "an effective field"))
     size = Size(settings.plays, settings.cells, settings.knots)
-    search = FieldSearch(data, size, job.least, job.structure, activation=settings.activation)
+    search = FieldSearch(
+        data,
+        size,
+        job.least,
+        job.structure,
+        activation=settings.activation,
+        accommodation=settings.accommodation,
+    )
     if isinstance(job.start, FieldEnd):
         found = search.go_on(job.start)
     else:
@@ -347,6 +361,7 @@ def _model(job: FitJob, found: FieldEnd) -> StagedModel:
         ),
         losses=known.losses,
         activation=known.activation,
+        accommodation=known.accommodation,
         **job.data.common(weights.offset_um),
     )
     return StagedModel.around(hysteresis, structure=known.structure, delay_s=known.delay_s)
@@ -366,7 +381,7 @@ FIELD = Fit(
     "densities by non-negative least squares, stages by search",
     HISTORIES,
     fit_field,
-    takes=(*STAGE_SETTINGS, "plays", "cells", "activation", "knots"),
+    takes=(*STAGE_SETTINGS, "plays", "cells", "activation", "accommodation", "knots"),
     published={"plays": 32, "cells": 12},
     whole=True,
     has_lag=True,

@@ -29,23 +29,25 @@ class Stages:
     damping: float = 0.2  # its damping ratio
     delay: float = 0.03  # transport delay
     activation: float = 0.0  # width of the thermal activation of plays
+    accommodation: float = 0.0  # of plays
 
 
 NAMES = tuple(field.name for field in fields(Stages))
 PARAMETERS = (
     "field_s", "output_s", "decay_s", "growth", "excess", "self_growth",
-    "natural_hz", "damping_ratio", "delay_s", "activation_width",
+    "natural_hz", "damping_ratio", "delay_s", "activation_width", "accommodation",
 )  # fmt: skip
 """Published names, in the same order."""
-LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0, 0.0)
-HIGH = Stages(2.0, 2.0, 0.3, 10.0, 0.5, 10.0, 0.3, 2.0, LONGEST_DELAY, 0.0)
-STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.01, 0.5, 0.02, 0.05, 0.01, 0.002)
+LOW = Stages(0.0, 0.0, 0.0, 0.0, 0.0, 0.0, 0.01, 0.02, 0.0, 0.0, 0.0)
+HIGH = Stages(2.0, 2.0, 0.3, 10.0, 0.5, 10.0, 0.3, 2.0, LONGEST_DELAY, 0.0, 0.0)
+STEP = Stages(0.02, 0.02, 0.01, 0.05, 0.01, 0.5, 0.02, 0.05, 0.01, 0.002, 0.005)
 ACTIVATION = (0.002, 0.05)  # bounds of the width if plays creep
+MOST_ACCOMMODATION = 1.0  # if plays accommodate
 """Bounds, and changes that have about the same effect."""
 
 
 def row(stages: Stages) -> F64:
-    """Return stages as float64[9]."""
+    """Return stages as float64[11]."""
     return np.array([getattr(stages, name) for name in NAMES])
 
 
@@ -64,6 +66,7 @@ class Physical:
     delay_s: float
     lag_s: float
     activation: ThermalActivation | None = None
+    accommodation: float = 0.0
 
     @property
     def structure(self) -> FirstMode | None:
@@ -79,6 +82,7 @@ class Physical:
         named |= self.structure.model_dump() if self.structure else {}
         named |= {"delay_s": self.delay_s}
         named |= {"activation_width": self.activation.width} if self.activation else {}
+        named |= {"accommodation": self.accommodation} if self.accommodation else {}
         known = {name: named[name] for name in PARAMETERS if name in named}
         return {**known, "output_offset_um": offset_um}
 
@@ -103,6 +107,7 @@ def physical(stages: Stages, data: Prepared) -> Physical:
         stages.delay * unit_s,
         (stages.field + stages.output) * unit_s,
         ThermalActivation(width=width, rate=fastest) if width > 0.0 else None,
+        stages.accommodation / data.reach,
     )
 
 
@@ -122,6 +127,7 @@ def stages_of(known: Physical, data: Prepared) -> Stages:
         damping=known.damping_ratio,
         delay=known.delay_s / unit_s,
         activation=known.activation.width / data.reach if known.activation else 0.0,
+        accommodation=known.accommodation * data.reach,
     )
 
 
@@ -132,15 +138,24 @@ AT_BOUND = 1e-4  # of a range: distance to a bound that counts as at the bound
 
 @dataclass(frozen=True, slots=True)
 class StageSpace:
-    """Bounds of a search, float64[9] each."""
+    """Bounds of a search, float64[11] each."""
 
     low: F64
     high: F64
 
     @classmethod
-    def of(cls, data: Prepared, structure: Structure, *, activation: bool = False) -> Self:
+    def of(
+        cls,
+        data: Prepared,
+        structure: Structure,
+        *,
+        activation: bool = False,
+        accommodation: bool = False,
+    ) -> Self:
         """Return the space for a measured structure, an unknown one (True), or none (False)."""
         low, high = LOW, HIGH
+        if accommodation:
+            high = replace(high, accommodation=MOST_ACCOMMODATION)
         if activation:
             low, high = (
                 replace(each, activation=width)

@@ -111,6 +111,7 @@ def fake(monkeypatch: pytest.MonkeyPatch, errors: dict[str, float | None]) -> li
             "generalised_duhem": f"generalised_duhem {settings.cells}",
         }.get(settings.kind, settings.kind)
         name += " creeping" * settings.looks_for("activation")
+        name += " accommodating" * settings.looks_for("accommodation")
         if settings.has("structure") and not settings.structure:
             name += " rigid"
         rms = errors.get(name)
@@ -158,6 +159,14 @@ def test_plays_that_creep_are_tried_in_full_if_rests_creep(monkeypatch):
     settings, _ = chosen([HISTORY])
     assert settings.activation
     assert [name for name, _ in seen][-1] == "field 16 creeping"
+
+
+def test_plays_that_accommodate_are_tried_if_all_others_are_poor(monkeypatch):
+    poor = {"field 8": 3.0, "generalised_duhem 12": 4.0}
+    better = {"field 8 accommodating": 0.7, "field 32 accommodating": 0.1}
+    fake(monkeypatch, poor | better)
+    settings, _ = chosen([HISTORY])
+    assert (settings.plays, settings.accommodation) == (32, True)
 
 
 def test_more_operators_are_taken_only_where_they_are_worth_it(monkeypatch):
@@ -247,6 +256,7 @@ def test_candidates_look_for_the_parts_that_are_asked_for(monkeypatch):
         ("field", False, False),
         ("generalised_duhem", False, False),
         ("integrated", True, True),
+        ("field", False, False),
     ]
 
 

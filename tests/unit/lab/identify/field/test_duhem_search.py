@@ -177,7 +177,10 @@ def test_paths_keep_the_turns_and_points_no_further_apart_than_was_asked_for():
     assert coarse.field.min() == path.field.min()
 
 
-@pytest.mark.parametrize("stage", [k for k, name in enumerate(NAMES) if name != "activation"])
+OF_PLAYS = {"activation", "accommodation"}
+
+
+@pytest.mark.parametrize("stage", [k for k, name in enumerate(NAMES) if name not in OF_PLAYS])
 def test_paths_follow_every_stage_but_the_offset(stage):
     kept, fresh = (Points(Signals(data()), FIRST, 1e-3) for _ in range(2))
     (before,) = kept.paths(FIRST)

@@ -13,7 +13,7 @@ from hilctl.models.effective_field import FieldLosses, FieldModel, OutputCurve, 
 from hilctl.models.linear_stages import FirstMode
 
 RATE_HZ = 20_000.0
-STAGES = stages.Stages(0.3, 0.2, 0.1, 0.4, 0.06, 0.5, 0.08, 0.9, 0.11, 0.02)
+STAGES = stages.Stages(0.3, 0.2, 0.1, 0.4, 0.06, 0.5, 0.08, 0.9, 0.11, 0.02, 0.3)
 TIME_S = np.arange(2000) / RATE_HZ
 COMMAND = 4.0 * np.sin(2.0 * np.pi * 50.0 * TIME_S) + np.sin(2.0 * np.pi * 230.0 * TIME_S)
 
@@ -36,7 +36,7 @@ def test_a_search_can_begin_at_the_defaults_and_step_either_way():
     assert (low <= stages.row(stages.Stages())).all()
     assert (stages.row(stages.Stages()) <= high).all()
     assert (step > 0.0).all()
-    assert (2.0 * step <= high - low)[:-1].all()  # plays creep only if asked
+    assert (2.0 * step <= high - low)[:-2].all()  # plays relax only if asked
     assert (low >= 0.0).all()
     # Without inertia or damping there is no structure: natural_hz is worked out as 1 / radian.
     assert stages.LOW.radian > 0.0
@@ -58,6 +58,7 @@ def test_units_by_hand():
     )
     assert known.losses.model_dump() == pytest.approx(losses.model_dump())
     assert known.activation == ThermalActivation(width=0.08, rate=400.0)
+    assert known.accommodation == pytest.approx(0.075)
     linear = known.radian_s, known.damping_ratio, known.delay_s
     assert linear == pytest.approx((0.0008, 0.9, 0.0011))
     assert stages.row(stages.stages_of(known, data)) == pytest.approx(stages.row(STAGES))
