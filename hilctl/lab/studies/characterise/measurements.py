@@ -94,8 +94,12 @@ class StepResponseCheck:
 
     @property
     def clear(self) -> bool:
-        """Whether it is above the noise."""
-        return abs(self.gain_um) > _CLEAR * self.doubt_um and self.gain_um != 0.0
+        """Whether the part in phase, which has a sign, is above the noise.
+
+        A stage held by friction creeps by less than its noise, a quarter of a cycle late.
+        """
+        in_phase_um = self.gain_um * abs(math.cos(math.radians(self.angle_deg)))
+        return abs(in_phase_um) > _CLEAR * self.doubt_um and self.gain_um != 0.0
 
     @property
     def even(self) -> bool:

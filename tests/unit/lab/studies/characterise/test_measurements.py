@@ -83,6 +83,13 @@ def test_the_phase_is_that_of_a_delay(limits, played):
     assert found.angle_deg == pytest.approx(360.0 * found.frequency_hz * 10 / 5000.0, rel=0.05)
 
 
+def test_a_motion_a_quarter_of_a_cycle_late_has_no_sign(limits, played):
+    late = round(0.25 * 5000.0 / limits.middle_hz)
+    found = reaction(limits, played, lambda v: 0.1 * np.roll(v, late), noise_um=0.002)
+    assert abs(found.gain_um) > 6.0 * found.doubt_um
+    assert not found.clear
+
+
 def test_a_segment_says_where_the_sine_is(make_recording):
     """A ramp before the segment is ignored."""
     index = np.arange(3000)
