@@ -21,7 +21,7 @@ from collections.abc import Collection, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from tokenize import TokenError
-from typing import Any, TypeAlias
+from typing import Any, ClassVar, TypeAlias
 from zipfile import BadZipFile
 
 import numpy as np
@@ -154,9 +154,12 @@ class Table(ABC):
         names: Names of the columns, or their numbers from 1.
     """
 
-    def __init__(self, path: Path, names: Sequence[str], units: Sequence[str] = ()) -> None:
-        self.path = path
-        self.names = list(names)
+    _ROW: ClassVar[str] = ":"  # between the file and a line
+
+    def __init__(
+        self, path: Path, names: Sequence[str], count: int, units: Sequence[str] = ()
+    ) -> None:
+        self.path, self.names, self._total = path, list(names), count
         self._units = list(units) or [_unit_in(name) for name in names]
 
     def index(self, column: Column | None) -> int:
@@ -202,7 +205,6 @@ class Table(ABC):
         found = named or [at for at in range(len(self.names)) if self.unit(at)[0] in units]
         return found[0] if len(found) == 1 else None
 
-    @abstractmethod
     def read(
         self,
         columns: Sequence[int],
@@ -214,40 +216,48 @@ class Table(ABC):
 
         Values of column ``gaps`` may be missing: empty, not finite, or the mark of an overload;
         they are NaN. Raise DataError if there are no such rows, and RowError if another value is
-        not a finite number.
+        not a finite number, or a row of text is longer or shorter than the others.
         """
+        check_rows(self.path, self._total, first_row, last_row)
+        values, lines = self._values(slice(first_row - 1, last_row), columns, gaps)
+        missing = _missing(values)
+        bad = np.argwhere(missing & (np.array(columns) != gaps))
+        if bad.size:
+            row, column = bad[0]
+            more = np.unique(bad[:, 0]).size - 1
+            text = f"{self._place(lines[row], columns[column])}, got {values[row, column]}"
+            text += f"; so in {more} more rows" if more else ""
+            raise RowError(text, first_row + int(row), self._total)
+        values[missing] = np.nan
+        return TableRows(self.path, np.ascontiguousarray(values.T), lines, first_row)
+
+    @abstractmethod
+    def _values(
+        self, rows: slice, columns: Sequence[int], gaps: int | None
+    ) -> tuple[F64, npt.NDArray[np.int64]]:
+        """Return the values, float64[rows, columns], and the line of each row."""
+
+    def _place(self, line: int, column: int) -> str:
+        """Return the place and the rule of a value that is not a finite number."""
+        name, number = self.names[column], str(column + 1)
+        called = f"column {number}" if name == number else f"column {number} ({name})"
+        return f"{self.path}{self._ROW}{line}: {called}: must be a finite number"
 
 
 class ArrayTable(Table):
     """Columns in memory, arrays of one length by name."""
 
-    def __init__(self, path: Path, columns: dict[str, npt.NDArray[np.generic]]) -> None:
-        super().__init__(path, list(columns))
-        self._columns = list(columns.values())
+    _ROW = ": row "
 
-    def read(
-        self,
-        columns: Sequence[int],
-        first_row: int = 1,
-        last_row: int | None = None,
-        gaps: int | None = None,
-    ) -> TableRows:
-        """Read some columns of some rows; see :meth:`Table.read`."""
-        check_rows(self.path, self._columns[0].size, first_row, last_row)
-        rows = slice(first_row - 1, last_row)
+    def __init__(self, path: Path, columns: dict[str, npt.NDArray[np.generic]]) -> None:
+        self._columns = list(columns.values())
+        super().__init__(path, list(columns), self._columns[0].size)
+
+    def _values(
+        self, rows: slice, columns: Sequence[int], gaps: int | None
+    ) -> tuple[F64, npt.NDArray[np.int64]]:
         values = np.array([self._columns[each][rows] for each in columns], dtype=np.float64)
-        missing = _missing(values)
-        bad = np.argwhere(missing.T & (np.array(columns) != gaps))
-        if bad.size:
-            row, column = bad[0]
-            raise RowError(
-                f"{self.path}: row {first_row + row}: {self.names[columns[column]]}: must be a "
-                f"finite number, got {values[column, row]}",
-                first_row + int(row),
-                self._columns[0].size,
-            )
-        values[missing] = np.nan
-        return TableRows(self.path, values, first_row + np.arange(values.shape[1]), first_row)
+        return values.T, np.arange(1, self._total + 1)[rows]
 
 
 def _missing(values: F64) -> npt.NDArray[np.bool_]:
@@ -320,7 +330,8 @@ class TextTable(Table):
         if not names:
             comments = (self.cells(line[1:]) for _, line in lines if line[0] in _COMMENT)
             names = next((each for each in comments if len(each) == self._count), [])
-        super().__init__(path, names or [str(i + 1) for i in range(self._count)], units)
+        names = names or [str(i + 1) for i in range(self._count)]
+        super().__init__(path, names, len(self._rows), units)
 
     def cells(self, line: str) -> list[str]:
         """Return the cells of a line; none if it is no row of a table."""
@@ -363,43 +374,11 @@ class TextTable(Table):
             return before[-1], last
         return last, []
 
-    def read(
-        self,
-        columns: Sequence[int],
-        first_row: int = 1,
-        last_row: int | None = None,
-        gaps: int | None = None,
-    ) -> TableRows:
-        """Read some columns of some rows, see :meth:`Table.read`; other cells may have any content.
-
-        Raise RowError, with the line, also if a row is longer or shorter than the others.
-        """
-        check_rows(self.path, len(self._rows), first_row, last_row)
-        rows = self._rows[first_row - 1 : last_row]
-        table = self._values(rows, columns, gaps, first_row)
-        lines = np.array([number for number, _ in rows])
-        missing = _missing(table)
-        bad = np.argwhere(missing & (np.array(columns) != gaps))
-        if bad.size:
-            row, column = bad[0]
-            more = np.unique(bad[:, 0]).size - 1
-            text = f"must be a finite number, got {table[row, column]}"
-            text += f"; so in {more} more rows" if more else ""
-            place = self._place(lines[row], columns[column])
-            raise RowError(f"{place}: {text}", first_row + int(row), len(self._rows))
-        table[missing] = np.nan
-        return TableRows(self.path, np.ascontiguousarray(table.T), lines, first_row)
-
     def _values(
-        self,
-        rows: list[tuple[int, str]],
-        columns: Sequence[int],
-        gaps: int | None,
-        first_row: int,
-    ) -> F64:
-        """Return the values, float64[rows, columns]; raise RowError at the first invalid one."""
-        values = array("d")
-        for row, (number, line) in enumerate(rows, start=first_row):
+        self, rows: slice, columns: Sequence[int], gaps: int | None
+    ) -> tuple[F64, npt.NDArray[np.int64]]:
+        values, chosen = array("d"), self._rows[rows]
+        for row, (number, line) in enumerate(chosen, start=rows.start + 1):
             cells = self.cells(line)
             if len(cells) != self._count:
                 rule = f"must have {self._count} columns, as the others have, got {len(cells)}"
@@ -410,16 +389,10 @@ class TextTable(Table):
                 if value is None and column == gaps and _MISSING.fullmatch(cells[column]):
                     value = np.nan
                 if value is None:
-                    text = f"must be a finite number, got {_short(cells[column])}"
-                    text = f"{self._place(number, column)}: {text}"
+                    text = f"{self._place(number, column)}, got {_short(cells[column])}"
                     raise RowError(text, row, len(self._rows))
                 values.append(value)
-        return np.array(values).reshape(-1, len(columns))
-
-    def _place(self, line: int, column: int) -> str:
-        name, number = self.names[column], str(column + 1)
-        called = f"column {number}" if name == number else f"column {number} ({name})"
-        return f"{self.path}:{line}: {called}"
+        return np.array(values).reshape(-1, len(columns)), np.array([each for each, _ in chosen])
 
 
 def _decoded(path: Path, raw: bytes) -> str:
