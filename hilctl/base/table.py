@@ -182,10 +182,12 @@ class Table(ABC):
         if len(found) == 1:
             return found[0]
         what = "more than one" if found else "no"
-        raise DataError(
-            f"{self.path}: has {what} column {column!r}: its columns are {', '.join(names)}; "
-            f"numbers are 1 to {len(names)}"
-        )
+        raise DataError(f"{self.path}: has {what} column {column!r}: its columns are {self.listed}")
+
+    @property
+    def listed(self) -> str:
+        """Numbers and names of the columns, for a message."""
+        return ", ".join(f"{at}: {name}" for at, name in enumerate(self.names, start=1))
 
     def bare_name(self, index: int) -> str:
         """Return a column's name without a unit in brackets."""

@@ -21,7 +21,7 @@ from functools import cache
 from string import Formatter
 from typing import Annotated, ClassVar, Literal, Self, TypeAlias
 
-from pydantic import AfterValidator, Field, model_validator
+from pydantic import AfterValidator, Field, StringConstraints, model_validator
 
 from hilctl.base.strict import StrictModel
 from hilctl_drivers.ascii.number_format import NumberFormat, as_text, number_format
@@ -103,14 +103,8 @@ def fields_of(template: str) -> set[str]:
     return {field for _, field, _, _ in Formatter().parse(template) if field}
 
 
-def _check_terminator(text: str) -> str:
-    if not 1 <= len(text) <= 8 or not text.isascii():
-        rule = 'must be 1 to 8 ASCII characters, such as "\\r\\n" or "> "'
-        raise ValueError(f"{rule}, got {text!r}")
-    return text
-
-
-Terminator: TypeAlias = Annotated[str, AfterValidator(_check_terminator)]
+_ASCII = StringConstraints(min_length=1, max_length=8, pattern=r"^[\x00-\x7f]+$")
+Terminator: TypeAlias = Annotated[str, _ASCII]
 
 
 class TextLines(StreamSettings):

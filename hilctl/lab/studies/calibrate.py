@@ -111,10 +111,9 @@ def _columns(table: Table, asked: dict[str, Column | None]) -> list[int]:
         named = named if column is None else [table.index(column)]
         found += named if len(named) == 1 else []
     if len(set(found)) < len(asked):
-        names = ", ".join(f"{at}: {name}" for at, name in enumerate(table.names, start=1))
         rule = "must have one column of readings and one of true displacements"
         cure = "set --reading-column and --true-column, by name or number"
-        raise DataError(f"{table.path}: {rule}: {cure}; its columns are {names}")
+        raise DataError(f"{table.path}: {rule}: {cure}; its columns are {table.listed}")
     return found
 
 

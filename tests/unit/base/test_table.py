@@ -34,7 +34,7 @@ def test_columns(tmp_path: Path) -> None:
     names = ["t", "x", "x", "4"]
     table = Names(tmp_path / "t.csv", names)
     assert [table.index(column) for column in ("t", 1, "4", 4, 2)] == [0, 0, 3, 3, 1]
-    known = "its columns are t, x, x, 4; numbers are 1 to 4"
+    known = "its columns are 1: t, 2: x, 3: x, 4: 4"
     for column, what in ((0, "no"), (5, "no"), (-1, "no"), ("T", "no"), ("x", "more than one")):
         text = f"t.csv: has {what} column {column!r}: {known}"
         assert refusal(table.index, column) == text

@@ -121,8 +121,8 @@ def _columns(table: Table, settings: TableSettings) -> list[int]:
         raise DataError(f"{table.path}: set either --time-column or --rate-hz (got both)")
     missing = ", ".join(option for option, at in found.items() if at is None)
     if missing:
-        names = ", ".join(f"{at}: {name}" for at, name in enumerate(table.names, start=1))
-        raise DataError(f"{table.path}: set {missing}, by name or number; its columns are {names}")
+        rule = f"set {missing}, by name or number"
+        raise DataError(f"{table.path}: {rule}; its columns are {table.listed}")
     columns = [at for at in found.values() if at is not None]
     if columns[0] == columns[1]:
         rule = f"command and displacement are both column {table.names[columns[0]]}"

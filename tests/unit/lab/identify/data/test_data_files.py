@@ -213,7 +213,7 @@ def test_units_are_those_of_the_columns(tmp_path):
         table(path, "drive", "gap", time_column=1, unit="V")
     with pytest.raises(DataError, match="--time-column"):
         table(path, "drive", "gap", time_column="monitor")
-    with pytest.raises(DataError, match=r"t \[ms\], drive .*--command-column"):
+    with pytest.raises(DataError, match=r"t \[ms\], 2: drive .*--command-column"):
         table(path, "current", "gap", time_column=1)
 
 
