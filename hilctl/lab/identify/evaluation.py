@@ -205,12 +205,20 @@ def motions_of(
         if places and STROKES[stroke] < 1.0:
             # Parts of histories are as large as their class allows, but represent all of it.
             span_um = min(span_um, STROKES[stroke] * stroke_um)
-        peak, rms = (
-            100.0 * of(averaged_um) / span_um for of in (cycle_metrics.peak, cycle_metrics.rms)
-        )
+        rms_um = cycle_metrics.rms(averaged_um)
+        noise_um2 = _noise_um2(error_um[start:stop]) / window if window > 1 else 0.0
+        quiet_um = math.sqrt(max(rms_um**2 - noise_um2, 0.0))
+        rms = 100.0 * quiet_um / span_um
+        peak = rms * cycle_metrics.peak(averaged_um) / rms_um if rms_um else 0.0
         middle_um = 0.5 * float(low_um + high_um)
         found.append(MotionError(stroke, peak, rms, middle_um, frequency_hz, label))
     return found
+
+
+def _noise_um2(error_um: F64) -> float:
+    """Return the variance of white noise in an error that has many samples per cycle."""
+    # Third differences of noise have 20 times its variance, those of slow errors vanish.
+    return float(np.mean(np.diff(error_um, 3) ** 2)) / 20.0
 
 
 def _cut(measured_um: F64, turns: I64, stroke_um: float) -> Iterator[tuple[tuple[int, int], int]]:

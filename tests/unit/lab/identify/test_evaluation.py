@@ -67,6 +67,20 @@ def test_a_long_record_has_an_error_for_each_stroke():
     assert doubled == {"half stroke", "quarter stroke", "tenth stroke"}
 
 
+@pytest.mark.parametrize("error_um", [0.0, 0.01, 0.1])
+def test_sensor_noise_is_not_an_error_of_the_model(error_um):
+    time_s = np.arange(20_000) / 10_000.0
+    command = np.sin(20.0 * np.pi * time_s)
+    noise_um = 0.02 * np.random.default_rng(4).standard_normal(time_s.size)
+    off_um = error_um * np.sin(100.0 * np.pi * time_s)
+    record = History("h", command, command + off_um + noise_um, 10_000.0)
+    (full,) = judge(PpiModel(direct=1.0, weights=(), thresholds=()), [record]).classes
+    averaged = np.sinc(5.0 / 25.0)  # a harmonic over a 25th of a cycle
+    expected = 100.0 * error_um * averaged / np.ptp(record.displacement_um)
+    assert full.rms_percent == pytest.approx(expected / np.sqrt(2.0), abs=0.05)
+    assert full.peak_percent == pytest.approx(expected, abs=0.45)
+
+
 TURN = 2.0 * np.pi * np.arange(400) / 400
 
 
