@@ -49,7 +49,7 @@ class Measured:
     slow: tuple[LoopMetrics, ...] = ()  # loops at the lowest frequency
     fast: tuple[LoopMetrics, ...] = ()  # loops at several frequencies
     reversal: ReversalCurves | None = None
-    biased: tuple[LoopMetrics, ...] = ()  # small loops over the whole range
+    biased: tuple[LoopMetrics, ...] = ()  # loops over the whole range, each from rest
     crept_percent: tuple[float, ...] = ()  # creep in each hold, of the motion to it
     repeated: Repeatability | None = None  # change of the largest growing loop at the end
 
@@ -172,7 +172,7 @@ history."""
 VALIDATED: Mapping[str, str] = {
     "held-out": "random reference",
     "reversal-curves": "first-order reversal curves",
-    "biased-loops": "small loops all over the range",
+    "biased-loops": "loops over the whole range, each from rest",
 }
 """Steps for validation only, with their labels, the most important first."""
 
@@ -245,7 +245,7 @@ def validate(
     model: HysteresisModel, recording: Recording, noise_um: float, label: str
 ) -> ValidationReference:
     """Validate a model on a recording that starts with a conditioning cycle."""
-    parts = recording.segments[1:]
+    parts = [each for each in recording.segments[1:] if each.kind != "hold"]
     history = _history(recording)
     command, measured_um = history.command, history.displacement_um
     modelled_um = model.forward(recording.sample_rate_hz).process(command)

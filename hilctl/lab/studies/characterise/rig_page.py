@@ -203,7 +203,7 @@ def _sheets(found: Characterisation) -> Iterator[FigureSpec]:
         ("Loops of growing amplitude.", measured.growing),
         ("Loops at the lowest frequency.", measured.slow),
         ("Loops at several frequencies.", [e for e in measured.fast if e.amplitude > large]),
-        ("Small loops over the whole range.", measured.biased),
+        ("Loops over the whole range, each from rest.", measured.biased),
     ):
         if loops:
             yield loops_sheet(caption, loops, unit)

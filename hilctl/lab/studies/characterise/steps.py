@@ -290,7 +290,7 @@ _ROWS: list[_Row] = [
     ("fast-loops", "loops at several frequencies", _fast, _take_fast),
     ("reversal-curves", "first-order reversal curves", _at_full(waveforms.reversal_curves),
      _take_reversal),
-    ("biased-loops", "small loops over the whole range", _at_full(waveforms.biased_loops),
+    ("biased-loops", "loops over the whole range, each from rest", _at_full(waveforms.biased_loops),
      _take_biased),
     ("creep", "creep at both ends of the range", _at_full(waveforms.rests), _take_creep),
     ("small-motions", "small random motions", _at_full(waveforms.small_motions),

@@ -33,11 +33,17 @@ _PERIODS = (6, 100)
 _CONDITIONING_CYCLES = 12
 _RANDOM_CYCLES = 8.0
 _REVERSALS = 9
-_BIASES = (0.7, 0.35, 0.0, -0.35, -0.7)
 _TRIES = 5
-_OF_BIAS = 0.15
 _OF_REST = 0.8
 _SMALL = ((0.6, 0.35), (-0.6, 0.35), (0.0, 0.35), (0.87, 0.11), (-0.87, 0.11), (0.0, 0.11))
+_FROM_REST = (
+    (0.95, (0.0,)),
+    (0.5, (0.45, -0.45)),
+    (0.25, (0.7, -0.7)),
+    (0.12, (0.85, 0.0, -0.85)),
+)
+"""Amplitudes of loops from rest, of the full amplitude, and their offsets."""
+_FROM_REST_S = 1.0
 _SETTLED = (
     (0.1, (-0.9, -0.45, 0.0, 0.45, 0.9)),
     (0.25, (-0.75, -0.375, 0.0, 0.375, 0.75)),
@@ -78,9 +84,9 @@ def _scaled(limits: CharacterisationLimits, keys: Keys, scale: float) -> Keys:
     return changed
 
 
-def at_rest(limits: CharacterisationLimits) -> Keys:
+def at_rest(limits: CharacterisationLimits, duration_s: float = REST_S) -> Keys:
     """Hold the safe value."""
-    return {"kind": "hold", "unit": limits.unit, "level": limits.rest, "duration_s": REST_S}
+    return {"kind": "hold", "unit": limits.unit, "level": limits.rest, "duration_s": duration_s}
 
 
 def sine(
@@ -188,12 +194,16 @@ def reversal_curves(limits: CharacterisationLimits, amplitude: float) -> Keys:
 
 
 def biased_loops(limits: CharacterisationLimits, amplitude: float) -> Keys:
-    """Return small loops over the whole range, after conditioning."""
-    small = _OF_BIAS * amplitude
-    parts = (
-        sine(limits, small, limits.middle_hz, 4.0, offset=limits.centre + part * amplitude)
-        for part in _BIASES
-    )
+    """Return loops of all sizes over the whole range, each from rest, after conditioning."""
+    # A run starts from rest: what relaxes there is an offset of its first cycles, which motions
+    # that follow each other do not have.
+    parts = []
+    for hz in (limits.middle_hz, _RANDOM_BAND[1] * limits.highest_hz):
+        for size, places in _FROM_REST:
+            for place in places:
+                offset = limits.centre + place * amplitude
+                loop = sine(limits, size * amplitude, hz, 4.0, offset=offset, soft=1.0)
+                parts += [at_rest(limits, _FROM_REST_S), loop]
     return _conditioned(limits, amplitude, *parts)
 
 

@@ -232,11 +232,17 @@ def test_a_segment_without_a_cycle_has_no_loop(make_recording):
         loop_metrics(run, run.segments[0])
 
 
-def test_small_loops_have_their_places(limits, played):
+def test_biased_loops_have_their_places_and_begin_from_rest(limits, played):
     run = played(limits, biased_loops(limits, 3.0), plays)
     found = all_loops(run)
-    assert [each.bias for each in found] == pytest.approx([2.1, 1.05, 0.0, -1.05, -2.1], abs=0.02)
-    assert all(each.amplitude == pytest.approx(0.45, rel=1e-2) for each in found)
+    places = [0.0, 1.35, -1.35, 2.1, -2.1, 2.55, 0.0, -2.55]
+    sizes = [2.85, 1.5, 1.5, 0.75, 0.75, 0.36, 0.36, 0.36]
+    for each in (found[:8], found[8:]):
+        assert [loop.bias for loop in each] == pytest.approx(places, abs=0.03)
+        assert [loop.amplitude for loop in each] == pytest.approx(sizes, rel=0.02)
+    assert found[0].frequency_hz < found[8].frequency_hz
+    before = [segment for segment in run.segments if segment.kind == "hold"]
+    assert len(before) == len(found)
 
 
 LOOP = LoopMetrics("x", 1.0, 0.0, 5.0, -5.0, 5.0, 10.0, 0.0, np.zeros(4), np.zeros(4))
