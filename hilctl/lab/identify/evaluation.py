@@ -207,7 +207,9 @@ def motions_of(
             span_um = min(span_um, STROKES[stroke] * stroke_um)
         rms_um = cycle_metrics.rms(averaged_um)
         noise_um2 = _noise_um2(error_um[start:stop]) / window if window > 1 else 0.0
-        quiet_um = math.sqrt(max(rms_um**2 - noise_um2, 0.0))
+        # The mean square of that many averages is no more certain.
+        least_um2 = noise_um2 * math.sqrt(2.0 * window / (stop - start))
+        quiet_um = math.sqrt(max(rms_um**2 - noise_um2, least_um2))
         rms = 100.0 * quiet_um / span_um
         peak = rms * cycle_metrics.peak(averaged_um) / rms_um if rms_um else 0.0
         middle_um = 0.5 * float(low_um + high_um)

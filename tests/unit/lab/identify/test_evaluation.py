@@ -77,7 +77,7 @@ def test_sensor_noise_is_not_an_error_of_the_model(error_um):
     (full,) = judge(PpiModel(direct=1.0, weights=(), thresholds=()), [record]).classes
     averaged = np.sinc(5.0 / 25.0)  # a harmonic over a 25th of a cycle
     expected = 100.0 * error_um * averaged / np.ptp(record.displacement_um)
-    assert full.rms_percent == pytest.approx(expected / np.sqrt(2.0), abs=0.05)
+    assert full.rms_percent == pytest.approx(expected / np.sqrt(2.0), abs=0.1)
     assert full.peak_percent == pytest.approx(expected, abs=0.45)
 
 
