@@ -84,7 +84,8 @@ def cycle_error(
     step_hz = recording.sample_rate_hz / segment.period
     count = harmonic_count(segment.period, step_hz, highest_hz)
     each = _each_cycle(recording.path, part, segment, count)
-    scatter = np.sqrt(np.mean(np.abs(each - each.mean(axis=0)) ** 2, axis=0) / (len(each) - 1))
+    # Successive cycles, because a drift within a run repeats in the next one, and can be learned.
+    scatter = np.sqrt(np.mean(np.abs(np.diff(each, axis=0)) ** 2, axis=0) / (2.0 * len(each)))
     strongest_hz, answer = _answer(part, segment, step_hz, waveform_cycles)
     return CycleScore(
         harmonics_um=each.mean(axis=0),
