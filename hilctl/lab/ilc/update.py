@@ -1,8 +1,9 @@
 """Update of the correction from the errors so far: pure functions of frozen state.
 
-Each update subtracts the error of each harmonic, filtered by the inverse of the identified
-response. The bandwidth grows while the error falls. If the error grows, the next step starts from
-the best correction, with half the gain and a smaller bandwidth.
+Each update starts from the combination of the runs so far with the smallest error, and subtracts
+the error of each harmonic, filtered by the inverse of the identified response. The bandwidth grows
+while the error falls. If the error grows, the next step starts from the best correction, with half
+the gain and a smaller bandwidth.
 
 The errors of axes that move at the same time depend on each other. Their learners learn from the
 same runs, and end together, with the corrections of one run.
@@ -31,6 +32,9 @@ _CLEAR = 4.0
 _FIRST_DOUBT = 0.05
 _FIT_DOUBT = 0.3
 """Standard deviation of the fitted response at a harmonic, as a share of it."""
+
+_CHANGE_DOUBT = 0.1
+"""Standard deviation of the effect of a change if others are added to it, as a share of it."""
 
 # Parameters: log gain, delay in samples, (highest / natural frequency)^2, log damping ratio.
 _BELIEVED = np.array([0.0, 1.0, 0.0, math.log(0.2)])
@@ -314,10 +318,31 @@ def _moved(state: IlcState, base: IlcIteration) -> C128:
     frequency = np.arange(error.harmonics_um.size, dtype=np.float64) * error.step_hz
     answer = _answer(state, frequency)
     inverse = np.conj(answer) / (np.abs(answer) ** 2 + _LEAST_ANSWER**2)
-    step = inverse * error.harmonics_um * _above_noise(error) * _taper(frequency, state.reach_hz)
-    moved: C128 = base.correction_um - state.gain * step
+    correction_um, error_um = _combined(state, base)
+    step = inverse * error_um * _above_noise(error) * _taper(frequency, state.reach_hz)
+    moved: C128 = correction_um - state.gain * step
     moved[0] = moved[0].real
     return moved
+
+
+def _combined(state: IlcState, base: IlcIteration) -> tuple[C128, C128]:
+    """Return the combination of all corrections with the smallest error, and that error.
+
+    Between the runs, the error changes linearly with the correction (multisecant equations; D. G.
+    Anderson, J. ACM 12 (1965) 547). This includes what a harmonic does to others.
+    """
+    others = [trial for trial in state.trials if trial is not base]
+    moved_um = [trial.correction_um - base.correction_um for trial in others]
+    changes_um = [trial.error.harmonics_um - base.error.harmonics_um for trial in others]
+    noises_um = [np.hypot(trial.error.noise_um, base.error.noise_um) for trial in others]
+    if not others:
+        return base.correction_um, base.error.harmonics_um
+    moved, changes = np.array(moved_um).T, np.array(changes_um).T
+    products = (np.conj(changes.T) @ changes).real
+    doubt = np.sum(np.square(noises_um), axis=1) + _CHANGE_DOUBT**2 * np.diag(products)
+    against = (np.conj(changes.T) @ base.error.harmonics_um).real
+    shares = -np.linalg.solve(products + np.diag(doubt), against)
+    return base.correction_um + moved @ shares, base.error.harmonics_um + changes @ shares
 
 
 def _above_noise(error: CycleScore) -> F64:

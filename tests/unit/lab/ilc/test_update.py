@@ -100,6 +100,12 @@ def test_the_error_goes_to_the_noise_floor(response, coupling):
     assert max(peaks(state)) == peaks(state)[0]
 
 
+def test_strongly_coupled_harmonics_are_learned():
+    """A harmonic moves its two neighbours by 40 % each, as a resonance that moves does."""
+    state = learned(Plant(RESONANT, 0.4))
+    assert min(peaks(state)) < 0.02 * peaks(state)[0]
+
+
 @pytest.mark.slow
 def test_a_resonance_that_the_fit_lacks_is_learned():
     """The fit has one resonance. The plant has another, on a harmonic, with a gain of 5."""
