@@ -16,7 +16,7 @@ from hilctl.lab.identify.settings import FitSettings
 from hilctl.signals.cycle_metrics import MAD_TO_SIGMA, rms
 
 Refit: TypeAlias = Callable[[Sequence[Record]], tuple[float, float] | None]
-"""Returns the rms error on held-out parts of the records, and that of a new fit to changed ones."""
+"""Returns the rms error, on held-out parts if any, and that of a new fit to changed records."""
 
 HALF = 0.5  # of an rms error: the largest one without its cause
 DRIFT, FEWEST_TURNS = 0.02, 6  # smallest drift, of the stroke, and turns that show it

@@ -151,8 +151,11 @@ def identify_records(request: FitRequest) -> Identification:
     fit = _with_provenance(fit, update)
 
     def refit(others: Sequence[Record]) -> tuple[float, float] | None:
-        again = held_out_error(replace(request, records=others, settings=selection.settings))
-        if again is None or best.held_out is None:
+        asked = replace(request, records=others, settings=selection.settings)
+        if best.held_out is None:
+            return best.fit.rms_percent, fit_model(asked).rms_percent
+        again = held_out_error(asked)
+        if again is None:
             return None
         return best.held_out.judgement.rms_percent, again.judgement.rms_percent
 
@@ -176,7 +179,7 @@ def _at_bound(request: FitRequest, best: ModalFit) -> tuple[ModalFit, tuple[str,
     parts = {"structure": False, "modes": False}
     settings = selection.settings.model_copy(update=parts)
     rigid = replace(request, settings=settings, modes=())
-    other = held_out_error(rigid)
+    other = held_out_error(replace(rigid, start=held_out.end))
     if other is None:
         return best, ()
     now, without = (each.judgement.stroke_percent for each in (held_out, other))

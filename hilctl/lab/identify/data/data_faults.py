@@ -25,6 +25,7 @@ SLOW = 1.5  # of the lowest frequency: loops whose phase is due to hysteresis, n
 SPIKE = 20.0  # ratio of a spike to what 99 % of the samples differ from their neighbours
 SPIKE_ROWS, SPIKE_AROUND = 2, 9  # most samples of a small spike; samples that it is compared with
 MOST_NAMED = 5  # spikes in a message
+APART_FROM_OTHERS = 3.0  # ratio of a single step to all other differences of neighbours
 KINK = 2.0  # smallest ratio of a step to the steps of the samples beside it
 SPIKE_STROKE = 0.02  # smallest spike or step, of the stroke of all other samples
 JUMP = 0.05  # of the command's range: a step of the command is no fault
@@ -70,7 +71,7 @@ def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[s
     elif along > 0.0 and float(np.median([_area(record) for record in slow])) < LEADING:
         yield (
             "the displacement leads the command: swap the columns of command and displacement, or "
-            "correct their timing"
+            "correct their timing (of a table with --set table.lag_samples)"
         )
 
 
@@ -136,7 +137,10 @@ def _step(record: Record) -> str:
     stays_um = float(y[at + 1] - y[at - 1])
     # At a kink of the displacement, the samples beside it differ as much.
     beside_um = max(np.ptp(y[max(at - 2, 0) : at]), np.ptp(y[at + 1 : at + 3]))
-    least_um = max(SPIKE * float(np.percentile(off, 99.0)), KINK * beside_um)
+    # In noise, 99 % of the samples are far below the largest one.
+    others_um = np.max(np.delete(off, slice(max(at - 3, 0), at + 2)), initial=0.0)
+    usual_um = min(SPIKE * float(np.percentile(off, 99.0)), APART_FROM_OTHERS * others_um)
+    least_um = max(usual_um, KINK * beside_um)
     is_step = abs(stays_um) > max(off[at - 1], SPIKE_STROKE * float(np.ptp(np.delete(y, at))))
     if not is_step or off[at - 1] <= least_um or abs(u[at + 1] - u[at - 1]) > JUMP * np.ptp(u):
         return ""
