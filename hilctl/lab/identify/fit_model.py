@@ -20,7 +20,6 @@ import hilctl
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64, I64
 from hilctl.experiment.model_validity import ALL, QUIET, spectrum
-from hilctl.experiment.sections.compensator import rests_at
 from hilctl.lab.identify.data.records import (
     FEWEST_POINTS,
     History,
@@ -38,7 +37,7 @@ from hilctl.models.linear_stages import CreepModel
 from hilctl.models.staged import StagedModel
 from hilctl.signals import cycle_metrics
 
-_REST_RATE_HZ = 10e3  # to simulate a rest, for records of unknown sample rate
+_HELD_S, _HELD_RATE_HZ = 0.1, 10e3  # commands held; rate for records of unknown sample rate
 COARSE_S = 1e-3
 LEAST_REST_S = 0.5
 STILL = 1e-6  # largest change per sample at rest, as a share of the command's range
@@ -340,14 +339,19 @@ def fit_model(request: FitRequest) -> FittedModel:
 
 
 def _range_um(model: HysteresisModel, data: FitData) -> tuple[float, float] | None:
-    """Return the displacements of the records that a steady command reaches, too.
+    """Return the displacements of the records that steady commands reach again and again.
 
-    Fast loops excite the structure, so they may reach far beyond those of a slow reference.
+    Fast loops excite the structure, so they may reach far beyond those of a slow reference, and a
+    drive of one sign does not return to its first rest.
     """
     if not isinstance(model, StagedModel):
         return model.output_range_um
-    rate_hz = 0.5 / data.half_period_s if data.half_period_s else _REST_RATE_HZ
-    low_um, high_um = sorted(rests_at(model, rate_hz, command) for command in data.input_range)
+    rate_hz = 0.5 / data.half_period_s if data.half_period_s else _HELD_RATE_HZ
+    low, high = data.input_range
+    held = np.repeat((high, low, high), max(round(_HELD_S * rate_hz), 1))
+    rigid = model.model_copy(update={"structure": None, "modes": ()})  # nothing rings at the steps
+    held_um = rigid.forward(rate_hz).process(held)
+    _, low_um, high_um = (float(part[-1]) for part in np.split(held_um, 3))
     return max(low_um, data.output_range_um[0]), min(high_um, data.output_range_um[1])
 
 

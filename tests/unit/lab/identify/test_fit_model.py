@@ -261,6 +261,16 @@ def test_overshoot_does_not_widen_the_range(records):
     assert [low_um, high_um] == pytest.approx([calm_um.min(), calm_um.max()], rel=0.1)
 
 
+def test_a_drive_of_one_sign_does_not_return_to_its_first_rest():
+    swept = np.interp(np.arange(6001) / 1000.0, np.arange(7.0), [0, 4, 0, 2, 1, 4, 0])
+    swung_um = StagedModel.around(SMALL_OMEGA).forward(RATE_HZ).process(swept)
+    records = [History("made", swept, swung_um, RATE_HZ)]
+    low_um, high_um = fit_model(FitRequest(records, FIELD, "A")).model.output_range_um
+    assert low_um == pytest.approx(swung_um[2000], abs=0.02 * np.ptp(swung_um))
+    assert high_um == pytest.approx(swung_um.max(), abs=0.02 * np.ptp(swung_um))
+    assert low_um > 0.03 * np.ptp(swung_um)
+
+
 def test_known_modes_are_taken_off_the_records_and_put_into_the_model(records):
     (record,) = records
     ringing_um = MODE.forward(RATE_HZ).process(record.displacement_um)
