@@ -11,6 +11,7 @@ from hilctl.base.types import C128, F64
 from hilctl.models.linear_stages import MODE_NUMBERS, modes_of, second_order
 
 _HYSTERESIS = 0.03  # share of a line that no linear response explains
+_DISTORTION = 0.01  # the same of the largest line: harmonics of a hysteresis reach all lines
 _WORTH = 0.5  # share of the misfit that a resonance must explain
 _MOST_DAMPING = 0.8
 _MOST_FURTHER = 2  # modes beside the first
@@ -115,7 +116,8 @@ def _best(
     hz: F64, response: C128, noise: F64, rate_hz: float, starts: Sequence[Sequence[float]]
 ) -> OptimizeResult:
     """Return the best fit from several starts with the same number of parameters."""
-    doubt = np.hypot(noise, _HYSTERESIS * np.abs(response))
+    size = np.abs(response)
+    doubt = np.hypot(np.hypot(noise, _HYSTERESIS * size), _DISTORTION * size.max())
     first, last = math.log(0.5 * hz[0]), math.log(1.5 * hz[-1])
     low = [-30.0, -1.0 / rate_hz, 0.0, first, math.log(1e-4)]
     high = [30.0, 1e4 / rate_hz, 1e3 / hz[-1], last, math.log(5.0)]

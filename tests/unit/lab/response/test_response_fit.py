@@ -35,6 +35,18 @@ def test_as_many_modes_as_there_are(response, natural_hz, further):
         assert mode.model_dump() == pytest.approx(MODE.model_dump(), rel=0.01)
 
 
+def test_harmonics_at_weak_lines_do_not_move_a_mode():
+    """A hysteresis spreads 0.5 % of the resonance over all lines, far above their noise."""
+    hz = np.arange(40.0, 6000.0, 40.0)
+    response = 1.0 / second_order(hz, 600.0, 0.03)
+    phase = np.random.default_rng(3).uniform(0.0, 2.0 * np.pi, hz.size)
+    response += 5e-3 * np.abs(response).max() * np.exp(1j * phase)
+    found = fitted_fields(hz, response, np.full(hz.size, 1e-4), RATE_HZ, held=False)
+    assert found["natural_hz"] == pytest.approx(600.0, rel=0.002)
+    assert found["damping_ratio"] == pytest.approx(0.03, rel=0.05)
+    assert found["further"] == ()
+
+
 def test_no_mode_beyond_the_lines():
     """A mode that is added may move an earlier one there."""
     hz = np.arange(20.0, 201.0, 20.0)
