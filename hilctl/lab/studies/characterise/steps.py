@@ -35,6 +35,7 @@ _RANDOM_PART = 0.95
 _CYCLES = 12.0
 _LOUD_PERCENT = 5.0  # rms noise, of the whole stroke, that hides any motion
 _LEAST_MOTION = 6.0  # peak-to-peak displacement of the largest loop, over the rms noise
+_LEAST_COHERENCE = 0.5  # median of the small-signal response
 _CLEAR_OF_BAND = 1.5
 _SAFE_OF_RESONANCE = 3.0
 _MOST_SCATTER_PERCENT = 5.0
@@ -144,13 +145,18 @@ def _response(part: float, limits: Limits, measured: Measured) -> Keys | None:
 
 
 def _take_response(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
+    tried = 0.5 * float(np.ptp(recording.samples.command))
+    last = tried > 0.9 * SMALL_PARTS[-1] * limits.reach
+    part = f"at {100.0 * tried / limits.reach:.2g} % of the range"
     try:
         found = small_signal(recording)
     except RigProblemError as error:
-        tried = 0.5 * float(np.ptp(recording.samples.command))
-        if error.code != "noise" or tried > 0.9 * SMALL_PARTS[-1] * limits.reach:
+        if error.code != "noise" or last:
             raise
-        return measured, f"below the noise at {100.0 * tried / limits.reach:.2g} % of the range"
+        return measured, f"below the noise {part}"
+    if not last and np.median(found.coherence) < _LEAST_COHERENCE:
+        # A guide with friction hardly moves, or by stick and slip.
+        return measured, f"coherence {np.median(found.coherence):.2g} {part}"
     natural_hz = found.natural_hz
     delay = f"delay {1e3 * found.delay_s:.3g} ms, lag {1e3 * found.lag_s:.3g} ms"
     text = f"gain {found.gain_um:.3g} µm/{limits.unit}, {delay}"

@@ -1,8 +1,11 @@
 """Steps on a formula as the actuator, and every problem of the rig."""
 
+from types import SimpleNamespace
+
 import numpy as np
 import pytest
 
+from hilctl.lab.studies.characterise import steps
 from hilctl.lab.studies.characterise.measurements import RigProblemError
 from hilctl.lab.studies.characterise.results import Measured
 from hilctl.lab.studies.characterise.steps import STEPS, full_amplitude
@@ -70,6 +73,21 @@ def test_a_faint_reaction_is_asked_for_again(walked, limits):
     measured, names = walked(limits, lambda v: 0.2 * v, noise_um=0.15, last="response-2")
     assert names == ["rest", "polarity-1", "polarity-2", "response-1", "response-2"]
     assert measured.small.gain_um == pytest.approx(0.2, rel=0.1)
+
+
+def test_an_incoherent_response_is_asked_for_again_at_a_larger_amplitude(
+    played, limits, monkeypatch
+):
+    found = SimpleNamespace(
+        coherence=np.full(8, 0.1), natural_hz=None, gain_um=1.0, delay_s=0.0, lag_s=0.0
+    )
+    monkeypatch.setattr(steps, "small_signal", lambda recording: found)
+    first, second = (each for each in STEPS if each.name.startswith("response"))
+    taken = [
+        each.take(played(limits, each.waveform(limits, Measured()), plays), limits, Measured())
+        for each in (first, second)
+    ]
+    assert [measured.small for measured, _ in taken] == [None, found]
 
 
 @pytest.mark.parametrize(("actuator", "noise_um", "code", "said"), [
