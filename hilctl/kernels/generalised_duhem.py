@@ -31,10 +31,13 @@ from hilctl.base.types import F64, F64_2D, F64_3D, I64
 from hilctl.kernels.field import Losses
 from hilctl.kernels.jit import kernel
 
-Band: TypeAlias = tuple[F64_3D, F64_3D, F64_2D, F64]
+Nodes: TypeAlias = tuple[F64, F64_2D]
+"""Nodes of y, whole numbers of units above the lowest: the cell of each unit, float64[units]; lower
+node of each cell and the inverse of its width, float64[2, k - 1]."""
+Band: TypeAlias = tuple[F64_3D, F64_3D, F64_2D, F64, Nodes]
 """Slopes float64[2, k, l], rising then falling, at k nodes of y and l across the band; longest step
 of y that begins in each cell, float64[2, k - 1, l - 1]; centre line and flux at these y, float64[2,
-k]; lowest y, distance of nodes of y, half the band's width b, distance of nodes across it."""
+k]; lowest y, unit of its nodes, half the band's width b, distance of nodes across it; the nodes."""
 
 _BEFORE_POLE = 0.9
 _STEPS = 100
@@ -51,21 +54,30 @@ def _cell(place: float, cells: float) -> int:
 
 
 @kernel(inline=True)
-def _along(y: float, lines: F64_2D, line: int, grid: F64) -> float:
-    """Return the centre (line 0) or the flux (line 1) at a y, extrapolated at both ends."""
+def _place(y: float, grid: F64, nodes: Nodes) -> tuple[int, float]:
+    """Return the cell of a y, and the position in it; outside the cells, the nearest one."""
+    cells, ends = nodes
     place = (y - grid[0]) / grid[1]
-    i = _cell(place, lines.shape[1] - 1.0)
-    return float(lines[line, i] + (lines[line, i + 1] - lines[line, i]) * (place - i))
+    i = int(cells[_cell(place, float(cells.size))])
+    return i, (place - ends[0, i]) * ends[1, i]
+
+
+@kernel(inline=True)
+def _along(y: float, lines: F64_2D, line: int, grid: F64, nodes: Nodes) -> float:
+    """Return the centre (line 0) or the flux (line 1) at a y, extrapolated at both ends."""
+    i, a = _place(y, grid, nodes)
+    return float(lines[line, i] + (lines[line, i + 1] - lines[line, i]) * a)
 
 
 @kernel(inline=True)
 def _slope(
-    y: float, d: float, way: int, slopes: F64_3D, grid: F64
+    y: float, d: float, way: int, slopes: F64_3D, grid: F64, nodes: Nodes
 ) -> tuple[float, float, int, int, float, float]:
     """Return g, its slope across the band, the cells, and the position in these."""
-    place, across = (y - grid[0]) / grid[1], (d + grid[2]) / grid[3]
-    i, j = _cell(place, slopes.shape[1] - 1.0), _cell(across, slopes.shape[2] - 1.0)
-    a, b = min(max(place - i, 0.0), 1.0), min(max(across - j, 0.0), 1.0)
+    i, a = _place(y, grid, nodes)
+    across = (d + grid[2]) / grid[3]
+    j = _cell(across, slopes.shape[2] - 1.0)
+    a, b = min(max(a, 0.0), 1.0), min(max(across - j, 0.0), 1.0)
     low = slopes[way, i, j] + a * (slopes[way, i + 1, j] - slopes[way, i, j])
     high = slopes[way, i, j + 1] + a * (slopes[way, i + 1, j + 1] - slopes[way, i, j + 1])
     return low + b * (high - low), (high - low) / grid[3], i, j, a, b
@@ -74,22 +86,24 @@ def _slope(
 @kernel(inline=True)
 def _followed(y: float, w: float, target: float, band: Band) -> tuple[float, float]:
     """Return the field after y has moved to ``target``, and dw/dy of the last step."""
-    slopes, steps, lines, grid = band
+    slopes, steps, lines, grid, nodes = band
     way = 0 if target >= y else 1
     by_y, going, k = 0.0, True, 0
     while going:
         # Whole steps, then the remainder, so that the final field is continuous in the target.
-        first, _, i, j, _, _ = _slope(y, w - _along(y, lines, 0, grid), way, slopes, grid)
+        first, _, i, j, _, _ = _slope(
+            y, w - _along(y, lines, 0, grid, nodes), way, slopes, grid, nodes
+        )
         rest = target - y
         going = abs(rest) > steps[way, i, j] and k < _MOST_STEPS
         dy = math.copysign(steps[way, i, j], rest) if going else rest
         middle = y + 0.5 * dy
-        off = w + 0.5 * dy / first - _along(middle, lines, 0, grid)
-        by_y = 1.0 / _slope(middle, off, way, slopes, grid)[0]
+        off = w + 0.5 * dy / first - _along(middle, lines, 0, grid, nodes)
+        by_y = 1.0 / _slope(middle, off, way, slopes, grid, nodes)[0]
         if k == _MOST_STEPS:
             by_y = 1.0 / first  # of a step as long as this only Euler's w rises with y throughout
         y = y + dy if going else target
-        centre = _along(y, lines, 0, grid)
+        centre = _along(y, lines, 0, grid, nodes)
         w = min(max(w + dy * by_y, centre - grid[2]), centre + grid[2])
         k += 1
     return w, by_y
@@ -123,7 +137,7 @@ def duhem_columns(
     that are filled in, rising. ``w`` is float64[n], filled with the field, ``out`` float64[N, m]; m
     may be 0.
     """
-    slopes, steps, lines, grid = band
+    slopes, steps, lines, grid, nodes = band
     by_node, scale = np.zeros(out.shape[1]), 1.0  # the derivatives are their product
     row = 0
     for k in range(y.size):
@@ -131,17 +145,19 @@ def duhem_columns(
         way = 0 if y[k] >= last else 1
         going, part = True, 0
         while going:
-            first = _slope(last, field - _along(last, lines, 0, grid), way, slopes, grid)
+            first = _slope(
+                last, field - _along(last, lines, 0, grid, nodes), way, slopes, grid, nodes
+            )
             rest, longest = y[k] - last, steps[way, first[2], first[3]]
             going = abs(rest) > longest and part < _MOST_STEPS
             dy = math.copysign(longest, rest) if going else rest
             middle = last + 0.5 * dy
-            off = field + 0.5 * dy / first[0] - _along(middle, lines, 0, grid)
-            half = _slope(middle, off, way, slopes, grid)
+            off = field + 0.5 * dy / first[0] - _along(middle, lines, 0, grid, nodes)
+            half = _slope(middle, off, way, slopes, grid, nodes)
             if part == _MOST_STEPS:
                 half = first
             last = last + dy if going else y[k]
-            centre = _along(last, lines, 0, grid)
+            centre = _along(last, lines, 0, grid, nodes)
             free = field + dy / half[0]
             field = min(max(free, centre - grid[2]), centre + grid[2])
             part += 1
@@ -180,13 +196,14 @@ def _lost(e: float, losses: Losses) -> tuple[float, float]:
 @kernel(inline=True)
 def _moved(y: float, memory: F64, band: Band, losses: Losses) -> tuple[float, float, float, float]:
     """Return w, z and the command after a sample that ends at y, and the command's slope."""
-    lines, grid = band[2], band[3]
+    lines, grid, nodes = band[2], band[3], band[4]
     w, by_y = _followed(memory[0], memory[1], y, band)
-    flux = _along(y, lines, 1, grid) - _along(memory[0], lines, 1, grid)
+    flux = _along(y, lines, 1, grid, nodes) - _along(memory[0], lines, 1, grid, nodes)
     lost, steeper = _lost(losses[0] * (w - memory[1]) + losses[1] * flux, losses)
     z = losses[2] * memory[2] + (1.0 - losses[2]) * lost
-    i = _cell((y - grid[0]) / grid[1], lines.shape[1] - 1.0)
-    e_by_y = losses[0] * by_y + losses[1] * (lines[1, i + 1] - lines[1, i]) / grid[1]
+    i, _ = _place(y, grid, nodes)
+    flux_by_y = losses[1] * (lines[1, i + 1] - lines[1, i]) / grid[1] * nodes[1][1, i]
+    e_by_y = losses[0] * by_y + flux_by_y
     mean = memory[1] + losses[9] * (w - memory[1])
     command = mean + losses[8] * memory[2] + (1.0 - losses[8]) * lost
     return w, z, command, losses[9] * by_y + (1.0 - losses[8]) * steeper * e_by_y

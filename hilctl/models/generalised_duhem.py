@@ -4,15 +4,18 @@ from collections.abc import Iterator
 from typing import Literal, TypeAlias
 
 import numpy as np
+from numpy.lib.stride_tricks import sliding_window_view
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, I64
 from hilctl.kernels.field import Losses
 from hilctl.kernels.generalised_duhem import Band, duhem_forward, duhem_inverse
 from hilctl.models.base import HysteresisModel, Operator, Weights
 from hilctl.models.effective_field import FieldLosses
 
 Slopes: TypeAlias = tuple[Weights, ...]
+Places: TypeAlias = tuple[float, float, I64]
 _LEAST_STEPS = 2.0  # steps of y from node to node, at least
+_MOST_UNITS = 10_000  # of nodes of y
 _NUMBERS = 3  # of the memory, before the previous input
 
 
@@ -28,7 +31,9 @@ class GeneralisedDuhemModel(HysteresisModel):
 
     Attributes:
         lowest_um: First node of y.
-        cell_um: Distance of the nodes of y, > 0.
+        cell_um: Unit of the distances of nodes of y, > 0.
+        nodes: Nodes of y in units of ``cell_um`` above the first, rising from 0; if empty, they are
+            one unit apart.
         centre: c at each node of y, rising, in the input unit; the ends continue linearly.
         flux: m at each node, rising, in um; source of eddy currents.
         half_width: Half width of the band around the centre, in the input unit, > |c(0)|, because y
@@ -43,6 +48,7 @@ class GeneralisedDuhemModel(HysteresisModel):
     kind: Literal["generalised_duhem"] = "generalised_duhem"
     lowest_um: float
     cell_um: float
+    nodes: tuple[int, ...] = ()
     centre: Weights
     flux: Weights
     half_width: float
@@ -57,9 +63,17 @@ class GeneralisedDuhemModel(HysteresisModel):
             rule = f"half_width must be at least |c(0)|, {least:g}, so that rest is in the band"
             yield f"{rule}: {self.half_width!r}"
 
-    def _table_problems(self) -> Iterator[str]:
+    def _place_problems(self) -> Iterator[str]:
         if not self.cell_um > 0.0:
             yield f"cell_um must be > 0: {self.cell_um!r}"
+        nodes = self._nodes()
+        if nodes[0] != 0 or nodes.size != len(self.centre) or any(np.diff(nodes) <= 0):
+            yield f"nodes must rise from 0, one per value of centre: {list(self.nodes)}"
+        elif nodes[-1] > _MOST_UNITS:
+            yield f"nodes must be at most {_MOST_UNITS}: {nodes[-1]}"
+
+    def _table_problems(self) -> Iterator[str]:
+        yield from self._place_problems()
         nodes = len(self.centre)
         for name in ("centre", "flux"):
             line = getattr(self, name)
@@ -79,10 +93,13 @@ class GeneralisedDuhemModel(HysteresisModel):
                 yield f"{name} must be > 0 for the inverse to exist: {least[0]!r}"
 
     def _centre_at_rest(self) -> float:
-        place = -self.lowest_um / self.cell_um
-        i = int(min(max(np.floor(place), 0), len(self.centre) - 2))
+        place, nodes = -self.lowest_um / self.cell_um, self._nodes()
+        i = int(np.clip(np.searchsorted(nodes, place, side="right") - 1, 0, nodes.size - 2))
         rise = self.centre[i + 1] - self.centre[i]
-        return self.centre[i] + rise * (place - i)
+        return float(self.centre[i] + rise * (place - nodes[i]) / (nodes[i + 1] - nodes[i]))
+
+    def _nodes(self) -> I64:
+        return np.array(self.nodes or range(len(self.centre)), dtype=np.int64)
 
     @property
     def operators(self) -> int:
@@ -92,7 +109,8 @@ class GeneralisedDuhemModel(HysteresisModel):
     def _band(self) -> Band:
         slopes = np.array([self.rising, self.falling])
         lines = np.array([self.centre, self.flux])
-        return band_of(slopes, lines, self.lowest_um, self.cell_um, self.half_width)
+        places = self.lowest_um, self.cell_um, self._nodes()
+        return band_of(slopes, lines, places, self.half_width)
 
     def _losses(self, sample_rate_hz: float) -> Losses:
         span = self.centre[-1] - self.centre[0]
@@ -110,17 +128,22 @@ class GeneralisedDuhemModel(HysteresisModel):
         return Operator(duhem_inverse, parameters, _NUMBERS, input_offset=-self.output_offset_um)
 
 
-def band_of(slopes: F64, lines: F64, lowest_um: float, cell_um: float, half_width: float) -> Band:
+def band_of(slopes: F64, lines: F64, places: Places, half_width: float) -> Band:
     """Return an operator for kernels, from slopes float64[2, k, l] > 0 and lines float64[2, k].
 
-    The lines are centre and flux at k nodes of y, ``cell_um`` apart from ``lowest_um`` on.
+    The lines are centre and flux at k nodes of y. ``places`` has the lowest node, the unit of the
+    nodes' distances, and the nodes in this unit above the lowest, int64[k].
     """
+    lowest_um, unit_um, nodes = places
     apart = 2.0 * half_width / (slopes.shape[2] - 1)
-    steps = longest_steps(slopes, lines[0], cell_um, apart)
-    return slopes, steps, lines, np.array([lowest_um, cell_um, half_width, apart])
+    widths = np.diff(nodes)
+    steps = longest_steps(slopes, lines[0], unit_um * widths, apart)
+    cells = np.repeat(np.arange(float(widths.size)), widths)
+    ends = np.array([nodes[:-1], 1.0 / widths])
+    return slopes, steps, lines, np.array([lowest_um, unit_um, half_width, apart]), (cells, ends)
 
 
-def longest_steps(slopes: F64, centre: F64, cell_um: float, apart: float) -> F64:
+def longest_steps(slopes: F64, centre: F64, widths_um: F64, apart: float) -> F64:
     """Return the longest steps of y for which w rises with y for any shorter step.
 
     A step s takes dw = s / g at its middle, which rises with s if
@@ -130,15 +153,17 @@ def longest_steps(slopes: F64, centre: F64, cell_um: float, apart: float) -> F64
     Returns:
         float64[2, k - 1, l - 1], by the cell in which a step begins.
     """
-    by_y = np.abs(np.diff(slopes, axis=1)) / cell_um
+    by_y = np.abs(np.diff(slopes, axis=1)) / widths_um[:, None]
     by_w = np.abs(np.diff(slopes, axis=2)) / apart
     by_y = np.maximum(by_y[:, :, :-1], by_y[:, :, 1:])
     by_w = np.maximum(by_w[:, :-1], by_w[:, 1:])
     least = _of_neighbours(-_of_corners(-slopes), np.minimum)
-    centre_slope = (np.diff(centre) / cell_um)[None, :, None]
+    centre_slope = (np.diff(centre) / widths_um)[:, None]
     off_by_y = np.maximum(1.0 / least, centre_slope)
     worst = np.maximum((by_y + by_w * off_by_y) / least, 0.5 * off_by_y / apart)
-    return np.minimum(cell_um / _LEAST_STEPS, 1.0 / _of_neighbours(worst, np.maximum))
+    around = sliding_window_view(np.pad(widths_um, 1, mode="edge"), 3)
+    most: F64 = around.min(axis=1)[:, None] / _LEAST_STEPS
+    return np.minimum(most, 1.0 / _of_neighbours(worst, np.maximum))
 
 
 def _of_corners(nodes: F64) -> F64:

@@ -10,7 +10,8 @@ from scipy.interpolate import RegularGridInterpolator
 from hilctl.kernels.generalised_duhem import duhem_columns, duhem_forward, duhem_inverse
 from hilctl.models.generalised_duhem import band_of
 
-NODES, ACROSS = np.linspace(-60.0, 40.0, 11), np.linspace(-1.0, 1.0, 7)
+UNIT, PLACES = 2.5, np.array([0, 4, 8, 12, 16, 20, 23, 25, 26, 32, 40])
+NODES, ACROSS = -60.0 + UNIT * PLACES, np.linspace(-1.0, 1.0, 7)
 CENTRE = 0.05 * NODES + 1e-4 * NODES**2 + 0.3
 FLUX = NODES + 0.003 * NODES**2
 SLOPES = np.stack(
@@ -25,9 +26,9 @@ LOSSES = (3.0, 0.02, 0.6, 0.1, 0.02, 0.05, 0.05, 0.01, 0.75, 0.55)
 
 def band(slopes=SLOPES, step=math.inf):
     """Return a band; steps are as long as they may be, or shorter."""
-    cell, lines = float(NODES[1] - NODES[0]), np.array([CENTRE, FLUX])
-    slopes, steps, lines, grid = band_of(slopes, lines, float(NODES[0]), cell, float(ACROSS[-1]))
-    return slopes, np.minimum(steps, step), lines, grid
+    lines, places = np.array([CENTRE, FLUX]), (float(NODES[0]), UNIT, PLACES)
+    slopes, steps, *others = band_of(slopes, lines, places, float(ACROSS[-1]))
+    return slopes, np.minimum(steps, step), *others
 
 
 BAND = band()

@@ -40,6 +40,30 @@ def test_rest_is_no_command_at_the_offset():
     assert duhem_model().forward(RATE_HZ).process(np.zeros(3)) == pytest.approx(0.7, abs=1e-9)
 
 
+def halved(table):
+    """Return a table with a row between every two."""
+    return np.insert(table, range(1, len(table)), (table[:-1] + table[1:]) / 2.0, axis=0)
+
+
+def test_cells_of_several_units_are_the_same_table():
+    even, wanted_um = duhem_model(), reference_um(3)
+    expected = even.inverse(RATE_HZ).process(wanted_um)
+    given = duhem_model(nodes=tuple(range(5))).inverse(RATE_HZ).process(wanted_um)
+    assert np.array_equal(given, expected)
+    nodes = (0, 1, 2, 3, 4, 6, 8)  # half of the cells are divided
+    lines = {
+        name: halved(np.array(getattr(even, name)))[list(nodes)]
+        for name in ("centre", "flux", "rising", "falling")
+    }
+    mixed = duhem_model(
+        cell_um=12.5,
+        nodes=nodes,
+        **{name: tuple(lines[name].tolist()) for name in ("centre", "flux")},
+        **{name: tuple(map(tuple, lines[name].tolist())) for name in ("rising", "falling")},
+    )
+    assert mixed.inverse(RATE_HZ).process(wanted_um) == pytest.approx(expected, abs=2e-3)
+
+
 def test_small_biased_loops_creep_down_from_the_falling_branch():
     loop = [*np.linspace(1.0, 1.2), *np.linspace(1.2, 1.0)]
     turns = np.concatenate([np.linspace(0.0, 4.0), np.linspace(4.0, 1.0), np.tile(loop, 6)])
@@ -105,6 +129,10 @@ ROWS = ((1.0, 2.0),) * 5
 
 @pytest.mark.parametrize(("changes", "words"), [
     ({"cell_um": 0.0}, "cell_um must be > 0"),
+    ({"nodes": (0, 1, 2, 3)}, "nodes must rise from 0"),
+    ({"nodes": (1, 2, 3, 4, 5)}, "nodes must rise from 0"),
+    ({"nodes": (0, 1, 2, 2, 3)}, "nodes must rise from 0"),
+    ({"nodes": (0, 1, 2, 3, 10**9)}, "nodes must be at most"),
     ({"centre": (-6.5, -2.4, -2.4, 1.9, 5.4)}, "centre must rise"),
     ({"flux": (-6.5, -2.4, -2.4, 1.9, 5.4)}, "flux must rise"),
     ({"flux": (-6.5, 5.4)}, "flux must have"),

@@ -413,7 +413,8 @@ def _model(job: FitJob, found: DuhemEnd) -> StagedModel:
     rising, falling = np.exp(found.logs)
     hysteresis = GeneralisedDuhemModel(
         lowest_um=layout.lowest_um - found.offset_um,
-        cell_um=layout.cell_um,
+        cell_um=layout.unit_um,
+        nodes=tuple(layout.nodes.tolist()),
         centre=tuple(layout.centre.tolist()),
         flux=tuple(found.flux.operators_of(layout.nodes_um).tolist()),
         half_width=layout.half_width,

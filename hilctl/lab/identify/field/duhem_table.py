@@ -6,9 +6,9 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.polynomial import Polynomial
-from scipy.interpolate import RegularGridInterpolator
+from scipy.interpolate import PchipInterpolator, RegularGridInterpolator
 
-from hilctl.base.types import F64
+from hilctl.base.types import F64, I64
 from hilctl.kernels.generalised_duhem import Band
 from hilctl.models.generalised_duhem import band_of
 
@@ -21,10 +21,12 @@ class Path:
     displacement_um: F64
 
 
+UNITS = 8  # of y in a cell, on average; nodes are whole numbers of units apart
 MARGIN = 0.02  # of the stroke: margin of the table beyond the data
 WIDER = 1.1  # width of the band, of that of the data
 DEGREE = 5  # of the first centre line: the middle of the widest loops would be steep in places
 FLATTEST = 0.2  # minimum slope of the centre, of its mean
+STEEP = 1.5  # slope of the centre above which cells are narrower, of its mean
 TILT = 0.6  # first guess: change of the logarithm of the slope from centre to edge
 BENT, TILTED = 0.009, 0.0016  # weights of second and first differences, percent of the stroke
 SHORTEST = 0.125  # of a cell: minimum step of a search
@@ -32,10 +34,11 @@ SHORTEST = 0.125  # of a cell: minimum step of a search
 
 @dataclass(frozen=True, slots=True)
 class Layout:
-    """Nodes of a table: lowest y and distance, centre of the band at each, and across the band."""
+    """Nodes of a table: of y in units above the lowest, centre of the band at each, and across."""
 
     lowest_um: float
-    cell_um: float
+    unit_um: float
+    nodes: I64
     centre: F64
     half_width: float
     across: int
@@ -43,7 +46,7 @@ class Layout:
     @property
     def nodes_um(self) -> F64:
         """Nodes of y."""
-        return np.asarray(self.lowest_um + self.cell_um * np.arange(self.centre.size))
+        return np.asarray(self.lowest_um + self.unit_um * self.nodes)
 
     @property
     def offsets(self) -> F64:
@@ -53,22 +56,21 @@ class Layout:
     @property
     def slopes(self) -> F64:
         """Slope of the centre line in each cell, um per command unit: float64[k - 1]."""
-        return np.asarray(self.cell_um / np.diff(self.centre))
+        return np.asarray(self.unit_um * np.diff(self.nodes) / np.diff(self.centre))
 
     def band(self, logs: F64, flux: F64) -> Band:
         """Return the operator of logarithms of slopes, float64[2, k, l], with a flux."""
         lines = np.array([self.centre, flux])
-        slopes, steps, lines, grid = band_of(
-            np.exp(logs), lines, self.lowest_um, self.cell_um, self.half_width
-        )
+        places = self.lowest_um, self.unit_um, self.nodes
+        slopes, steps, lines, grid, cells = band_of(np.exp(logs), lines, places, self.half_width)
         # A search needs no inverse, so its steps may be longer.
-        return slopes, np.maximum(steps, SHORTEST * self.cell_um), lines, grid
+        shortest = SHORTEST * self.unit_um * np.diff(self.nodes)[:, None]
+        return slopes, np.maximum(steps, shortest), lines, grid, cells
 
     def slopes_at(self, y_um: F64) -> F64:
         """Return the slope of the centre line at displacements."""
-        return np.asarray(
-            np.interp(y_um, self.nodes_um[:-1] + 0.5 * self.cell_um, self.slopes), dtype=np.float64
-        )
+        middles = 0.5 * (self.nodes_um[:-1] + self.nodes_um[1:])
+        return np.asarray(np.interp(y_um, middles, self.slopes), dtype=np.float64)
 
     def rest_um(self, field: F64, displacement_um: F64) -> float:
         """Return the displacement at zero field, from the start of a path and the centre line."""
@@ -105,22 +107,39 @@ def laid_over(
 ) -> Layout:
     """Return a layout over the range of paths, with cells of y and across the band.
 
-    The centre is a line through y and w, float64[k] each; a smooth line along the paths if None.
+    The centre is a line through y and w, float64[k] each, and cells are narrow where it is steep.
+    Without a line, the centre is a smooth line along the paths, and all cells are equal.
     """
     w = np.concatenate([path.field for path in paths])
     y = np.concatenate([path.displacement_um for path in paths])
-    room = MARGIN * float(np.ptp(y))
-    nodes = np.linspace(float(y.min()) - room, float(y.max()) + room, cells + 1)
-    centre = _extended(nodes, *line) if line else Polynomial.fit(y, w, DEGREE)(nodes)
-    least = FLATTEST * float(np.ptp(centre)) / cells
+    room, units = MARGIN * float(np.ptp(y)), cells * UNITS
+    y_um = np.linspace(float(y.min()) - room, float(y.max()) + room, units + 1)
+    centre = _extended(y_um, *line) if line else Polynomial.fit(y, w, DEGREE)(y_um)
+    least = FLATTEST * float(np.ptp(centre)) / units
     centre = centre[0] + np.concatenate(([0.0], np.cumsum(np.maximum(np.diff(centre), least))))
-    off = float(np.abs(w - np.interp(y, nodes, centre)).max())
-    return Layout(float(nodes[0]), float(nodes[1] - nodes[0]), centre, WIDER * off, across + 1)
+    nodes = _placed(centre, cells) if line else UNITS * np.arange(cells + 1)
+    off = float(np.abs(w - np.interp(y, y_um[nodes], centre[nodes])).max())
+    unit_um = float(y_um[1] - y_um[0])
+    return Layout(float(y_um[0]), unit_um, nodes, centre[nodes], WIDER * off, across + 1)
+
+
+def _placed(centre: F64, cells: int) -> I64:
+    """Return the nodes of cells over a centre line, float64[units + 1]: int64[cells + 1], in units.
+
+    Cells are equal as long as the centre is less steep than ``STEEP``. Near saturation, where a
+    small motion takes much of the command, all cells have the same share of the command.
+    """
+    units = centre.size - 1
+    shares = np.maximum(1.0 / units, np.diff(centre) / (STEEP * np.ptp(centre)))
+    # A cell is not narrower than a unit.
+    ends = np.concatenate(([0.0], np.cumsum(np.minimum(shares, 1.0 / cells))))
+    places = np.interp(ends[-1] * (np.arange(cells + 1) / cells), ends, np.arange(units + 1.0))
+    return np.asarray(np.floor(places + 0.5), dtype=np.int64)
 
 
 def _extended(x: F64, knots: F64, values: F64) -> F64:
-    """Interpolate points; extrapolate by the slope over a twentieth of them."""
-    inside = np.interp(x, knots, values)
+    """Interpolate points smoothly; extrapolate by the slope over a twentieth of them."""
+    inside = PchipInterpolator(knots, values)(np.clip(x, knots[0], knots[-1]))
     some = max(1, knots.size // 20)
     first = (values[some] - values[0]) / (knots[some] - knots[0])
     last = (values[-1] - values[-1 - some]) / (knots[-1] - knots[-1 - some])

@@ -122,7 +122,30 @@ def test_the_centre_follows_the_line_of_equal_slopes():
     most = here.offsets[-2]
     assert equal - here.centre == pytest.approx(np.clip(0.02 * here.nodes_um, -most, most))
     following = laid_over([loops()], 12, 6, (here.nodes_um, equal))
-    assert following.centre == pytest.approx(equal)
+    expected = np.interp(following.nodes_um, here.nodes_um, equal)
+    assert following.centre == pytest.approx(expected, abs=0.02)
+
+
+def test_cells_are_narrow_where_a_rod_saturates():
+    """In the upper tenth of the stroke, which takes half of the command."""
+    here = laid_over([loops()], 20, 6, (np.array([-60.0, 30.0, 40.0]), np.array([-5.0, 0.0, 5.0])))
+    widths, parts = np.diff(here.nodes_um), np.diff(here.centre) / np.ptp(here.centre)
+    steep = here.nodes_um[1:] > 30.0
+    assert steep.sum() >= 6
+    assert np.ptp(widths[:10]) <= 1.01 * here.unit_um
+    assert parts[steep].max() < 0.5 * 0.25  # of the command: even cells would have a quarter each
+
+
+def test_cells_are_equal_without_saturation():
+    here = laid_over([loops()], 20, 6, (np.array([-60.0, 40.0]), np.array([-5.0, 5.0])))
+    assert (np.diff(here.nodes) == np.diff(here.nodes)[0]).all()
+
+
+def test_no_cell_is_narrower_than_a_unit():
+    line = np.array([-60.0, 29.0, 29.1, 40.0]), np.array([-5.0, -4.9, 4.9, 5.0])
+    here = laid_over([loops()], 20, 6, line)
+    assert here.nodes.size == 21
+    assert np.diff(here.nodes).min() >= 1
 
 
 def test_a_table_moved_to_other_nodes_is_the_same_function():
