@@ -12,6 +12,9 @@ A mode is a pair of antiresonance and resonance. A mass on a damped spring follo
 linearly between samples; the output is (1 + 2 Z s / W + s^2 / W^2) of its position, with the
 acceleration from its spring. The output therefore includes a share of x itself, and the inverse is
 exact. The structure is a mode without an antiresonance: its output is the position.
+
+Its stiffness may depend on the place: the force k(y) (x - y) then moves the mass against a constant
+damper, with k at the position before each sample.
 """
 
 import math
@@ -187,11 +190,14 @@ def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 
 @kernel(inline=True)
-def _carried(parameters: F64, memory: F64) -> tuple[float, float]:
-    """Return position and velocity a sample later, without the effect of the next x."""
+def _carried(motion: F64, i: int, memory: F64) -> tuple[float, float]:
+    """Return position and velocity a sample later, without the effect of the next x.
+
+    The eight coefficients of the motion begin at ``i``.
+    """
     position, velocity, before = memory[0], memory[1], memory[2]
-    p = parameters[0] * position + parameters[1] * velocity + parameters[2] * before
-    q = parameters[4] * position + parameters[5] * velocity + parameters[6] * before
+    p = motion[i] * position + motion[i + 1] * velocity + motion[i + 2] * before
+    q = motion[i + 4] * position + motion[i + 5] * velocity + motion[i + 6] * before
     return p, q
 
 
@@ -211,7 +217,7 @@ def mode_block(x: F64, parameters: F64, memory: F64, out: F64) -> None:
     """
     for k in range(x.size):
         now = x[k]
-        p, q = _carried(parameters, memory)
+        p, q = _carried(parameters, 0, memory)
         if abs(p) + abs(q) < math.inf:
             position, velocity = p + parameters[3] * now, q + parameters[7] * now
         else:
@@ -240,7 +246,7 @@ def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
     """Run the exact inverse of :func:`mode_block`."""
     for k in range(y.size):
         now = y[k]
-        p, q = _carried(parameters, memory)
+        p, q = _carried(parameters, 0, memory)
         if abs(p) + abs(q) < math.inf:
             now = (now - parameters[8] * p - parameters[9] * q) / parameters[11]
             position, velocity = p + parameters[3] * now, q + parameters[7] * now
@@ -248,6 +254,72 @@ def unmode_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
             position, velocity = now, 0.0
         _keep(position, velocity, now, memory)
         out[k] = now
+
+
+@kernel(inline=True)
+def cell_of(y: float, lowest: float, cell: float, last: int) -> tuple[int, float]:
+    """Return the cell of a place, and the part of the cell below it.
+
+    A table has the values 0 to ``last`` at steps ``cell`` from ``lowest``, and is constant beyond.
+    """
+    place = min(max((y - lowest) / cell, 0.0), float(last)) if abs(y) < math.inf else 0.0
+    j = min(int(place), last - 1)
+    return j, place - j
+
+
+@kernel(inline=True)
+def _moved(motions: F64, i: int, memory: F64, now: float) -> tuple[float, float]:
+    """Return position and velocity a sample later; the coefficients begin at ``i``."""
+    p, q = _carried(motions, i, memory)
+    return p + motions[i + 3] * now, q + motions[i + 7] * now
+
+
+@kernel()
+def place_mode_block(
+    x: F64, lowest: float, cell: float, motions: F64, memory: F64, out: F64
+) -> None:
+    """Follow a displacement with a structure whose stiffness depends on the place.
+
+    ``motions`` is float64[8 n], motions of :func:`mode_block` at even steps ``cell`` of the
+    position from ``lowest`` on. ``memory`` is float64[3]: position, velocity, the previous x.
+    """
+    last = motions.size // 8 - 1
+    for k in range(x.size):
+        now = x[k]
+        j, part = cell_of(memory[0], lowest, cell, last)
+        p, q = _moved(motions, 8 * j, memory, now)
+        next_p, next_q = _moved(motions, 8 * (j + 1), memory, now)
+        position, velocity = p + part * (next_p - p), q + part * (next_q - q)
+        if not abs(position) + abs(velocity) < math.inf:
+            position, velocity = now, 0.0
+        _keep(position, velocity, now, memory)
+        out[k] = position
+
+
+@kernel()
+def place_unmode_block(
+    y: F64,
+    slope_gain: float,
+    bend_gain: float,
+    lowest: float,
+    cell: float,
+    relative: F64,
+    memory: F64,
+    out: F64,
+) -> None:
+    """Compute y + c(y) (slope_gain y' + bend_gain y'') per sample, a sample late.
+
+    ``relative`` is c at even steps ``cell`` of y from ``lowest`` on, float64[n]. ``memory`` is
+    float64[3]: the last two values, the previous one.
+    """
+    for k in range(y.size):
+        after = y[k]
+        before = _oldest(memory, after)
+        now = memory[0]
+        slope, bend = 0.5 * (after - before), after - 2.0 * now + before
+        j, part = cell_of(now, lowest, cell, relative.size - 1)
+        softer = relative[j] + part * (relative[j + 1] - relative[j])
+        out[k] = now + softer * (slope_gain * slope + bend_gain * bend)
 
 
 def exponential(matrix: F64) -> F64:

@@ -15,6 +15,7 @@ from hilctl.kernels.dynamics import (
     delay_block,
     mode_block,
     mode_motion,
+    place_mode_block,
     uncreep_block,
     unmode_block,
 )
@@ -161,27 +162,81 @@ class _CreepOperator(Operator):
 _SLOWEST = 1e12  # samples per radian of the structure; slower structures do not move
 
 
+_FINER = 16  # steps of motions per step of a compliance
+
+
+class Compliance(StrictModel):
+    """c(y): compliance at a place, relative to that of the natural frequency.
+
+    It is linear between its values, and constant beyond. Terfenol is stiffer where it is
+    magnetised: its compliance is linear in the magnetostriction, X. J. Zheng and X. E. Liu, "A
+    nonlinear constitutive model for Terfenol-D rods", J. Appl. Phys. 97 (2005) 053901.
+
+    Attributes:
+        lowest_um: Displacement of the first value.
+        cell_um: Displacement from each value to the next, > 0.
+        relative: c at these displacements, each > 0.
+    """
+
+    lowest_um: float
+    cell_um: float = Field(gt=0.0)
+    relative: tuple[Annotated[float, Field(ge=0.01, le=100.0)], ...] = Field(
+        min_length=2, max_length=64
+    )
+
+    @property
+    def table(self) -> tuple[float, float, F64]:
+        """The table of :func:`~hilctl.kernels.dynamics.place_unmode_block`."""
+        return self.lowest_um, self.cell_um, np.array(self.relative)
+
+
 class FirstMode(StrictModel):
-    """y'' / w^2 + 2 zeta y' / w + y = x: the mass of the actuator and its load on its stiffness.
+    """c (y'' / w^2 + 2 zeta y' / w) + y = x: the mass of actuator and load on its stiffness.
 
     Attributes:
         natural_hz: w / (2 pi), in Hz.
         damping_ratio: zeta.
+        compliance: c, if the stiffness depends on the displacement; 1 by default. The natural
+            frequency at a displacement is then natural_hz / sqrt(c), with the same mass and damper.
     """
 
     natural_hz: float = Field(gt=0.0, le=1e9)
     damping_ratio: float = Field(gt=0.0, le=10.0)
+    compliance: Compliance | None = None
 
     def forward(self, sample_rate_hz: float) -> Operator:
         """Return the structure, exact for an x that changes linearly between samples."""
+        if self.compliance is not None:
+            return self._by_place(self.compliance, sample_rate_hz)
         position = (1.0, 0.0, 0.0, 0.0)
         parameters = np.array([*self.motion(sample_rate_hz).ravel(), *position])
         return Operator(mode_block, (parameters,), 2)
+
+    def _by_place(self, compliance: Compliance, sample_rate_hz: float) -> Operator:
+        lowest_um, cell_um, relative = compliance.table
+        steps = np.arange((relative.size - 1) * _FINER + 1) / _FINER
+        motions = []
+        for softer in np.sqrt(np.interp(steps, np.arange(relative.size), relative)).tolist():
+            changed = {
+                "natural_hz": self.natural_hz / softer,
+                "damping_ratio": self.damping_ratio * softer,
+            }
+            motion = self.model_copy(update=changed).motion(sample_rate_hz)
+            motion[:, 1] *= softer  # velocities per radian of natural_hz
+            motion[1] /= softer
+            motions.append(motion.ravel())
+        parameters = lowest_um, cell_um / _FINER, np.concatenate(motions)
+        return Operator(place_mode_block, parameters, 2)
 
     @property
     def radian_s(self) -> float:
         """1 / w, in s."""
         return 0.5 / (math.pi * self.natural_hz)
+
+    def undoing(self, sample_rate_hz: float) -> tuple[float, float]:
+        """Return the gains of y' and y'' per sample, at a compliance of 1."""
+        radian = self.radian_s * sample_rate_hz
+        return 2.0 * self.damping_ratio * radian, radian**2
 
     def motion(self, sample_rate_hz: float) -> F64:
         """Return :func:`~hilctl.kernels.dynamics.mode_motion`: float64[2, 4].

@@ -20,7 +20,8 @@ from typing import Any, Literal, Self, TypeVar
 import numpy as np
 
 from hilctl.base.strict import Field, PrivateAttr, StrictModel
-from hilctl.kernels.dynamics import lag_block, lead_block, weigh_block
+from hilctl.base.types import F64
+from hilctl.kernels.dynamics import lag_block, lead_block, place_unmode_block, weigh_block
 from hilctl.models.base import HysteresisModel, InnerModel, Operator, Provenance
 from hilctl.models.linear_stages import (
     Chain,
@@ -41,6 +42,10 @@ def split_frame(model: Model) -> tuple[Model, dict[str, Any]]:
     names = ("input_unit", "input_range", "output_range_um", "provenance")
     bare = {"input_range": None, "output_range_um": None, "provenance": Provenance()}
     return model.model_copy(update=bare), {name: getattr(model, name) for name in names}
+
+
+def _weighed(weights: F64) -> Operator:
+    return Operator(weigh_block, (weights,), weights.size - 1)
 
 
 class FieldLag(StrictModel):
@@ -169,15 +174,19 @@ class StagedModel(HysteresisModel):
         if structure is None:
             weights, ahead = smoothing_weights(width)
         else:
-            radian = structure.radian_s * sample_rate_hz
-            width, gains = max(width, radian), (2.0 * structure.damping_ratio * radian, radian**2)
+            gains = structure.undoing(sample_rate_hz)
+            width = max(width, structure.radian_s * sample_rate_hz)
             if self._excites_structure:
                 weights, ahead = smoothing_weights(width, *gains)
             else:
-                smoothing, ahead = smoothing_weights(width)
+                weights, ahead = smoothing_weights(width)
+                if structure.compliance is not None:
+                    parameters = *gains, *structure.compliance.table
+                    undone = Operator(place_unmode_block, parameters, 2)
+                    return Chain([_weighed(weights), undone], preview=ahead + 1)
                 undoing, one = smoothing_weights(0.0, *gains)
-                weights, ahead = np.convolve(smoothing, undoing), ahead + one
-        inverse = Operator(weigh_block, (weights,), weights.size - 1)
+                weights, ahead = np.convolve(weights, undoing), ahead + one
+        inverse = _weighed(weights)
         inverse.preview = ahead
         return inverse
 

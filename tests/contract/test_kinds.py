@@ -57,6 +57,9 @@ CASES = {
     "staged": KindCase(StagedModel.around(OMEGA, **STAGES["all"]), inverse_percent=0.1,
                        fit="staged", settings={"plays": 8, "deadbands": 4, "starts": 1}),
     "linear lag": KindCase(StagedModel.around(OMEGA, **STAGES["linear lag"])),
+    "structure by place": KindCase(
+        StagedModel.around(OMEGA, **STAGES["structure by place"]), inverse_percent=0.1
+    ),
     "field": KindCase(StagedModel.around(field_model(lengths=(), slopes=PLAYS)), fit="field",
                       settings=SMALL),
     "drags": KindCase(StagedModel.around(field_model())),

@@ -6,7 +6,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as hnp
 
 from hilctl.models.integrated import IntegratedModel
-from hilctl.models.linear_stages import FirstMode, smoothing_weights
+from hilctl.models.linear_stages import Compliance, FirstMode, smoothing_weights
 from hilctl.models.plays import PpiModel, RdpiModel
 from hilctl.models.staged import FieldLag, StagedModel
 
@@ -40,7 +40,16 @@ LAGS = st.builds(
     growth_per_unit=st.one_of(st.just(0.0), st.floats(0.0, 100.0), st.floats(1e-12, 1e-6)),
 )
 STRUCTURES = st.builds(
-    FirstMode, natural_hz=st.floats(0.1, 1e6), damping_ratio=st.floats(1e-3, 10.0)
+    FirstMode,
+    natural_hz=st.floats(0.1, 1e6),
+    damping_ratio=st.floats(1e-3, 10.0),
+    compliance=st.none()
+    | st.builds(
+        Compliance,
+        lowest_um=LEVEL,
+        cell_um=st.floats(1e-3, 100.0),
+        relative=st.lists(st.floats(0.1, 10.0), min_size=2, max_size=4).map(tuple),
+    ),
 )
 MAYBE_STRUCTURES = st.none() | STRUCTURES
 SMOOTHINGS_S = st.just(0.0) | st.floats(0.0, 0.1)

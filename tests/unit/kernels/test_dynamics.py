@@ -17,11 +17,13 @@ from hilctl.kernels.dynamics import (
     unmode_block,
 )
 from hilctl.kernels.hysteresis import rest_memory
-from hilctl.models.linear_stages import FirstMode, FurtherMode, smoothing_weights
+from hilctl.models.linear_stages import Compliance, FirstMode, FurtherMode, smoothing_weights
 
 RATE_HZ = 20_000.0
 SIGNAL = 2.0 * np.sin(np.arange(400) / 9.0) + 0.6 * np.cos(np.arange(400) / 2.3)
 STRUCTURE = FirstMode(natural_hz=1500.0, damping_ratio=0.1).forward(RATE_HZ).parameters[0]
+COMPLIANCE = Compliance(lowest_um=-1.5, cell_um=1.0, relative=(1.6, 1.2, 1.0, 0.7))
+BY_PLACE = FirstMode(natural_hz=1500.0, damping_ratio=0.1, compliance=COMPLIANCE)
 LEFT, GAIN = np.array([0.5, 0.9, 0.999]), np.array([0.02, 0.004, 3e-5])
 PARAMETERS = np.concatenate((LEFT, GAIN))
 PAIR = FurtherMode(
@@ -34,6 +36,8 @@ STREAMING = {
     "lead": (dynamics.lead_block, (0.3, 0.4), 1),
     "linear lead": (dynamics.lead_block, (0.3, 0.0), 1),
     "structure": (mode_block, (STRUCTURE,), 2),
+    "structure by place": (dynamics.place_mode_block, BY_PLACE.forward(RATE_HZ).parameters, 2),
+    "inverse by place": (dynamics.place_unmode_block, (0.4, 4.0, *COMPLIANCE.table), 2),
     "weigh": (dynamics.weigh_block, (smoothing_weights(1.5, 0.3, 5.0)[0],), 10),
     "delay": (dynamics.delay_block, (), 4),
     "between": (dynamics.between_block, (0.3,), 0),
@@ -254,3 +258,32 @@ def test_nothing_is_one_and_a_turn_turns():
     turned = exponential(np.array([[0.0, -1.0], [1.0, 0.0]]) * math.pi / 3.0)
     half, side = 0.5, math.sqrt(0.75)
     np.testing.assert_allclose(turned, [[half, -side], [side, half]], rtol=1e-14)
+
+
+@pytest.mark.parametrize(("place", "cell", "part"), [
+    (-9.0, 0, 0.0), (-1.5, 0, 0.0), (-1.0, 0, 0.5), (0.5, 2, 0.0), (1.25, 2, 0.75), (1.5, 2, 1.0),
+    (9.0, 2, 1.0), (math.nan, 0, 0.0),
+])  # fmt: skip
+def test_a_table_is_constant_beyond_its_ends(place, cell, part):
+    assert dynamics.cell_of(place, -1.5, 1.0, 3) == pytest.approx((cell, part))
+    assert dynamics.cell_of.py_func(place, -1.5, 1.0, 3) == pytest.approx((cell, part))
+
+
+def test_a_structure_by_place_is_the_solution_of_its_equation():
+    """c(y) (y'' / w^2 + 2 zeta y' / w) + y = x; c follows the position a sample late."""
+    rate_hz, omega = 10.0 * RATE_HZ, 2.0 * np.pi * 1500.0
+    t = np.arange(4000) / rate_hz
+    x = 2.0 * np.sin(t * RATE_HZ / 9.0) + 0.6 * np.cos(t * RATE_HZ / 2.3)
+
+    def rates(time, state):
+        y, velocity = state
+        softer = np.interp(y, [-1.5, -0.5, 0.5, 1.5], COMPLIANCE.relative)
+        pull = (np.interp(time, t, x) - y) / softer
+        return velocity, omega**2 * pull - 2.0 * 0.1 * omega * velocity
+
+    ends = 0.0, t[-1]
+    solved = solve_ivp(rates, ends, (x[0], 0.0), t_eval=t, max_step=1e-5, rtol=1e-8, atol=1e-8)
+    out = BY_PLACE.forward(rate_hz).process(x)
+    np.testing.assert_allclose(out, solved.y[0], atol=0.01 * np.ptp(x))
+    plain = BY_PLACE.model_copy(update={"compliance": None}).forward(rate_hz).process(x)
+    assert np.abs(plain - solved.y[0]).max() > 0.1 * np.ptp(x)
