@@ -10,7 +10,7 @@ from hilctl.lab.identify.fit_data import FitData
 from hilctl.lab.identify.parallel import MapFunction
 from hilctl.lab.identify.settings import FitSettings
 from hilctl.models.base import HysteresisModel
-from hilctl.models.linear_stages import FirstMode, FurtherMode
+from hilctl.models.linear_stages import Compliance, FirstMode, FurtherMode
 
 LEAST_SLOPE = 0.01  # smallest slope that a model may have, of the mean slope of the data
 
@@ -52,6 +52,11 @@ class FitJob:
     progress: OnProgress = ignore_progress
     start: object | None = None
     structure: Structure = True
+
+    @property
+    def compliance(self) -> Compliance | None:
+        """Compliance of a measured structure by displacement; None if it does not depend on it."""
+        return self.structure.compliance if isinstance(self.structure, FirstMode) else None
 
     @property
     def least(self) -> float:

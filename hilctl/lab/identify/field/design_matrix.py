@@ -7,6 +7,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from hilctl.base.types import F64, F64_2D, I64, Mask
+from hilctl.kernels.dynamics import cell_of
 from hilctl.kernels.jit import kernel
 
 
@@ -44,17 +45,25 @@ def corners(x: F64, y: F64, off_x: float, off_y: float, thin: int, furthest: int
 
 @kernel(nogil=True)
 def bare_displacement(
-    derivatives: F64_2D, kept: I64, late: float, slope_gain: float, bend_gain: float, out: F64
+    derivatives: F64_2D,  # float64[3, n], y, y' and y''; the last sample is repeated
+    kept: I64,
+    late: float,
+    gains: tuple[float, float],
+    compliance: tuple[float, float, F64],  # c, see ``cell_of``
+    out: F64,
 ) -> None:
-    """Fill in y + slope_gain y' + bend_gain y'' ``late`` samples after each of ``kept``."""
-    # derivatives: float64[3, n], y, y' and y''; the last sample is repeated.
+    """Fill in y + c(y) (gains[0] y' + gains[1] y'') ``late`` samples after each of ``kept``."""
     y, slope, bend = derivatives[0], derivatives[1], derivatives[2]
     whole = math.floor(late)
     part, end = late - whole, y.size - 1
+    slope_gain, bend_gain = gains
+    lowest, cell, relative = compliance
     for i in range(kept.size):
         here, there = min(kept[i] + whole, end), min(kept[i] + whole + 1, end)
-        a = y[here] + slope_gain * slope[here] + bend_gain * bend[here]
-        b = y[there] + slope_gain * slope[there] + bend_gain * bend[there]
+        j, above = cell_of(y[here], lowest, cell, relative.size - 1)
+        softer = relative[j] + above * (relative[j + 1] - relative[j])
+        a = y[here] + softer * slope_gain * slope[here] + softer * bend_gain * bend[here]
+        b = y[there] + softer * slope_gain * slope[there] + softer * bend_gain * bend[there]
         out[i] = a + part * (b - a)
 
 

@@ -396,7 +396,8 @@ POINTS = 45  # samples kept of the fastest cycle
 
 def fit_generalised_duhem(job: FitJob) -> FoundModel:
     """Fit a table of slopes, losses, structure and delay; raise DataError for loops."""
-    data = Prepared(histories_of(job.data.records, "a table of slopes"), POINTS, OFF)
+    records = histories_of(job.data.records, "a table of slopes")
+    data = Prepared(records, POINTS, OFF, job.compliance)
     settings = job.settings
     search = DuhemSearch(data, settings.cells, settings.across, job.least, job.structure)
     if isinstance(job.start, DuhemEnd):

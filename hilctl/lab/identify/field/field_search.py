@@ -329,7 +329,8 @@ FINER = 8  # cells of the model's tables per piece of a spline
 def fit_field(job: FitJob) -> FoundModel:
     """Fit plays of a field, losses, structure and delay; raise DataError for loops."""
     settings = job.settings
-    data = Prepared(histories_of(job.data.records, "an effective field"))
+    records = histories_of(job.data.records, "an effective field")
+    data = Prepared(records, compliance=job.compliance)
     size = Size(settings.plays, settings.cells, settings.knots)
     search = FieldSearch(
         data,

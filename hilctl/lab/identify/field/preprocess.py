@@ -14,7 +14,7 @@ from hilctl.lab.identify.data.records import History, Record, SteadyLoop
 from hilctl.lab.identify.field.design_matrix import Motion, bare_displacement, corners
 from hilctl.lab.identify.parallel import parallel_map
 from hilctl.models.effective_field import final_weight
-from hilctl.models.linear_stages import smoothing_weights
+from hilctl.models.linear_stages import Compliance, smoothing_weights
 
 WIDER = 4.0  # of the first width: the second
 MEDIAN_SQUARE = 0.4549  # of normally distributed numbers with mean square 1
@@ -63,6 +63,7 @@ COMMAND_OFF = 1e-4  # the same for commands, at whose turns the operators turn
 SLOWEST_HZ = 0.35  # least top_hz: the longest lag, 1 s, belongs to it
 LONGEST_DELAY = 0.3  # in radians of the fastest cycle
 LONGEST = 0.3  # longest step, in cycles of the fastest
+SAME_EVERYWHERE = 0.0, 1.0, np.ones(2)  # table of a compliance of 1
 
 
 _Found = TypeVar("_Found")
@@ -94,6 +95,7 @@ class Run:
     derivatives: F64  # float64[3, N], displacement of all samples in um and its derivatives by time
     motion: Motion
     noise_correlation: float = 0.0  # of the smoothed displacements of neighbouring samples
+    compliance: Compliance | None = None  # of the structure, by displacement
     _late: Latest[tuple[F64, F64]] = field(default_factory=Latest, init=False, repr=False)
     _bare: Latest[F64] = field(default_factory=Latest, init=False, repr=False)
 
@@ -128,7 +130,8 @@ class Run:
     def _bare_um(self, delay_s: float, slope_s: float, bend_s2: float) -> F64:
         out = np.empty(self.kept.size)
         late = delay_s * self.rate_hz
-        bare_displacement(self.derivatives, self.kept, late, slope_s, bend_s2, out)
+        table = SAME_EVERYWHERE if self.compliance is None else self.compliance.table
+        bare_displacement(self.derivatives, self.kept, late, (slope_s, bend_s2), table, out)
         return out
 
 
@@ -136,9 +139,14 @@ class Prepared:
     """All records, prepared; ``top_hz`` is the frequency of a sine as fast as the fastest one."""
 
     def __init__(
-        self, records: Sequence[History], points: int = POINTS, command_off: float = COMMAND_OFF
+        self,
+        records: Sequence[History],
+        points: int = POINTS,
+        command_off: float = COMMAND_OFF,
+        compliance: Compliance | None = None,
     ) -> None:
         self._points, self._command_off = points, command_off
+        self.compliance = compliance
         self.reach = max(0.5 * float(np.ptp(record.command)) for record in records)
         self.stroke_um = max(float(np.ptp(record.displacement_um)) for record in records)
         fastest = max(_speed(record) for record in records)
@@ -167,7 +175,8 @@ class Prepared:
         judged = record.evaluated()[kept] & (kept < command.size - ahead)
         motion = Motion.of(both, step_s, judged, self.reach, self.stroke_um)
         correlation = _noise_correlation(width)
-        return Run(rate_hz, kept, step_s, at_end, mean, derivatives, motion, correlation)
+        signals = step_s, at_end, mean, derivatives, motion
+        return Run(rate_hz, kept, *signals, correlation, self.compliance)
 
 
 def _noise_correlation(width: float) -> float:

@@ -12,7 +12,7 @@ from hilctl.lab.identify.field.densities import Curve
 from hilctl.lab.identify.field.preprocess import LONGEST_DELAY, Prepared, Run
 from hilctl.lab.identify.fit_api import Structure
 from hilctl.models.effective_field import FieldLosses, ThermalActivation, even_excess
-from hilctl.models.linear_stages import FirstMode
+from hilctl.models.linear_stages import Compliance, FirstMode
 
 
 @dataclass(frozen=True, slots=True)
@@ -67,6 +67,7 @@ class Physical:
     lag_s: float
     activation: ThermalActivation | None = None
     accommodation: float = 0.0
+    compliance: Compliance | None = None
 
     @property
     def structure(self) -> FirstMode | None:
@@ -74,7 +75,9 @@ class Physical:
         if not self.radian_s > 0.0:
             return None
         natural_hz = 0.5 / (math.pi * self.radian_s)
-        return FirstMode(natural_hz=natural_hz, damping_ratio=self.damping_ratio)
+        return FirstMode(
+            natural_hz=natural_hz, damping_ratio=self.damping_ratio, compliance=self.compliance
+        )
 
     def parameters(self, offset_um: float) -> dict[str, float]:
         """Return all stages by their published names, with the displacement at rest."""
@@ -108,6 +111,7 @@ def physical(stages: Stages, data: Prepared) -> Physical:
         (stages.field + stages.output) * unit_s,
         ThermalActivation(width=width, rate=fastest) if width > 0.0 else None,
         stages.accommodation / data.reach,
+        data.compliance,
     )
 
 

@@ -218,7 +218,7 @@ class CharacterisationRunner:
         self._host.on_progress(1.0, "identify")
         rest = self._measured.rest
         try:
-            found = identified(self._recordings, self._measured.small)
+            found = identified(self._recordings, self._measured)
             found, apart = validated(found, self._recordings, rest.noise_um if rest else 0.0)
         except InputError as error:
             remedy = "check the loops on the page, or run 'hilctl identify' on the recordings"

@@ -19,6 +19,7 @@ from hilctl.lab.response.frequency_response import (
 )
 from hilctl.lab.response.segment_spectrum import RestNoise, spectra
 from hilctl.lab.spectrum import coefficients, each_cycle
+from hilctl.models.linear_stages import Compliance
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
 
@@ -141,6 +142,50 @@ def small_signal(recording: Recording) -> FrequencyResponse:
     except DataError as error:
         remedy = "on a busy computer, lower sample_rate_hz"
         raise RigProblemError("no_reading", str(error), remedy) from None
+
+
+@dataclass(frozen=True, slots=True)
+class LocalResonance:
+    """The resonance at a place of the stroke."""
+
+    place_um: float  # mean displacement
+    natural_hz: float
+    error_hz: float  # standard error
+
+
+def local_resonances(recording: Recording, found: FrequencyResponse) -> tuple[LocalResonance, ...]:
+    """Return the resonance of a response with its place; empty without one."""
+    if found.natural_hz is None:
+        return ()
+    samples, _ = steady_samples(recording, recording.segments[-1])
+    place_um = float(np.nanmean(samples.displacement_um))
+    return (LocalResonance(place_um, found.natural_hz, found.errors["natural_hz"]),)
+
+
+_CHANGED = 0.03  # change of the frequency that counts; less moves a sixth of it by 0.2 %
+_CERTAIN = 4.0  # the same, of its standard error
+_CELLS = 16
+
+
+def compliance_of(
+    places: Sequence[LocalResonance], stroke_um: tuple[float, float]
+) -> Compliance | None:
+    """Return the compliance over a stroke relative to the first place; None if it is the same."""
+    first_hz, error_hz = places[0].natural_hz, places[0].error_hz
+    if all(
+        abs(at.natural_hz - first_hz)
+        <= max(_CHANGED * first_hz, _CERTAIN * math.hypot(error_hz, at.error_hz))
+        for at in places
+    ):
+        return None
+    known = np.array(sorted((at.place_um, (first_hz / at.natural_hz) ** 2) for at in places)).T
+    at_um = np.linspace(*stroke_um, _CELLS + 1)
+    relative = np.interp(at_um, *known)
+    return Compliance(
+        lowest_um=stroke_um[0],
+        cell_um=(stroke_um[1] - stroke_um[0]) / _CELLS,
+        relative=tuple(relative.tolist()),
+    )
 
 
 _FEWEST_STEPS = 500  # distinct readings in a motion, for equal readings to mean saturation

@@ -27,12 +27,15 @@ from hilctl.lab.identify.pipeline import (
 from hilctl.lab.response.frequency_response import FrequencyResponse
 from hilctl.lab.response.segment_spectrum import RestNoise
 from hilctl.lab.studies.characterise.measurements import (
+    LocalResonance,
     LoopMetrics,
     Repeatability,
     ReversalCurves,
     StepResponseCheck,
+    compliance_of,
 )
 from hilctl.models.base import HysteresisModel
+from hilctl.models.linear_stages import FirstMode
 from hilctl.recording.reader import read
 from hilctl.recording.recording import Recording
 from hilctl.signals import cycle_metrics
@@ -45,6 +48,7 @@ class Measured:
     rest: RestNoise | None = None
     reaction: StepResponseCheck | None = None  # first reaction and its polarity
     small: FrequencyResponse | None = None  # small-signal response
+    resonances: tuple[LocalResonance, ...] = ()  # by place, that of the first response first
     growing: tuple[LoopMetrics, ...] = ()  # loops of growing amplitude
     slow: tuple[LoopMetrics, ...] = ()  # loops at the lowest frequency
     fast: tuple[LoopMetrics, ...] = ()  # loops at several frequencies
@@ -52,6 +56,16 @@ class Measured:
     biased: tuple[LoopMetrics, ...] = ()  # loops over the whole range, each from rest
     crept_percent: tuple[float, ...] = ()  # creep in each hold, of the motion to it
     repeated: Repeatability | None = None  # change of the largest growing loop at the end
+
+    @property
+    def structure(self) -> FirstMode | None:
+        """The measured structure, with its compliance if that depends on the place."""
+        structure = self.small.structure if self.small else None
+        if structure is None or not (self.resonances and self.growing):
+            return structure
+        stroke_um = self.growing[-1].low_um, self.growing[-1].high_um
+        compliance = compliance_of(self.resonances, stroke_um)
+        return structure.model_copy(update={"compliance": compliance})
 
 
 @dataclass(frozen=True, slots=True)
@@ -177,13 +191,13 @@ VALIDATED: Mapping[str, str] = {
 """Steps for validation only, with their labels, the most important first."""
 
 
-def identified(recordings: Mapping[str, Path], small: FrequencyResponse | None) -> Identification:
+def identified(recordings: Mapping[str, Path], measured: Measured) -> Identification:
     """Identify a model from complete histories; raise InputError if none can be identified."""
     # Small loops depend on the history of the actuator, which steady loops do not contain.
     fitted = parallel_map(read, [p for name, p in recordings.items() if name in FITTED])
     # The loops are too slow to determine the structure, which the small-signal response shows.
-    structure = small.structure if small else None
-    rigid = small is not None and structure is None
+    structure = measured.structure
+    rigid = measured.small is not None and structure is None
     with workers("threads") as run:
         return identify_records(
             FitRequest(

@@ -142,6 +142,11 @@ def _measured_rows(measured: Measured, unit: str) -> Iterator[tuple[str, str]]:
         if (hz := small.natural_hz) is not None:
             resonance = f"{quantity(hz, 'Hz', 4)}, damping ratio {small.damping_ratio:.2g}"
         yield "resonance", resonance
+        for at in measured.resonances[1:]:
+            yield (
+                "resonance off rest",
+                f"{quantity(at.natural_hz, 'Hz', 4)} at {at.place_um:.3g} µm",
+            )
         yield "residual of that fit", f"{small.misfit_percent:.2g} % rms of the gain"
     if measured.growing:
         largest = measured.growing[-1]

@@ -15,6 +15,7 @@ from hilctl.lab.studies.characterise.measurements import (
     all_loops,
     centre_line,
     crept_percent,
+    local_resonances,
     loop_metrics,
     next_amplitude,
     noise_at_rest,
@@ -29,6 +30,8 @@ from hilctl.recording.recording import Recording
 
 POLARITY_PARTS = (0.01, 0.03, 0.1)
 SMALL_PARTS = (0.05, 0.25)
+RESPONSE_PLACES = (-0.7, 0.0, 0.7)
+"""Parts of the full amplitude. The response is measured at those away from the first one's."""
 GROWING_PARTS = (0.1, 0.25, 0.5, 0.75, 1.0)
 
 _RANDOM_PART = 0.95
@@ -162,6 +165,7 @@ def _take_response(recording: Recording, limits: Limits, measured: Measured) -> 
     text = f"gain {found.gain_um:.3g} µm/{limits.unit}, {delay}"
     if natural_hz is None:
         return replace(measured, small=found), f"{text}, no resonance"
+    places = local_resonances(recording, found)
     if natural_hz < _CLEAR_OF_BAND * limits.highest_hz:
         band = f"{limits.lowest_hz:g} to {limits.highest_hz:g} Hz"
         raise RigProblemError(
@@ -171,7 +175,31 @@ def _take_response(recording: Recording, limits: Limits, measured: Measured) -> 
             f"set --highest-hz {natural_hz / _SAFE_OF_RESONANCE:.2g} or less, or stiffen the load",
         )
     text += f", resonance {natural_hz:.4g} Hz, damping {found.damping_ratio:.2g}"
-    return replace(measured, small=found), text
+    return replace(measured, small=found, resonances=places), text
+
+
+def _placed_response(part: float, limits: Limits, measured: Measured) -> Keys | None:
+    small, full = measured.small, full_amplitude(limits, measured)
+    if small is not None and small.natural_hz is None:
+        return None
+    amplitude = small.amplitude if small else SMALL_PARTS[0] * limits.reach
+    places = {each: limits.centre + each * full for each in RESPONSE_PLACES}
+    first = limits.beside_rest(amplitude)
+    if part == min(places, key=lambda each: abs(places[each] - first)):
+        return None
+    return waveforms.small_multisine(limits, amplitude, places[part])
+
+
+def _take_placed_response(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
+    try:
+        found = local_resonances(recording, small_signal(recording))
+    except RigProblemError as error:
+        if error.code != "noise":
+            raise
+        return measured, "below the noise"
+    text = "".join(f"resonance {at.natural_hz:.4g} Hz at {at.place_um:.3g} µm" for at in found)
+    after = replace(measured, resonances=(*measured.resonances, *found))
+    return after, text or "no resonance"
 
 
 def _growing(part: float, limits: Limits, measured: Measured) -> Keys | None:
@@ -306,6 +334,8 @@ _ROWS: list[_Row] = [
      _unevaluated("for the fit")),
     ("held-out", "random reference for the validation", _random(waveforms.HELD_OUT_SEED),
      _unevaluated("not used in any fit")),
+    *_numbered("placed-response", "small-signal response off rest", RESPONSE_PLACES,
+               _placed_response, _take_placed_response),
     ("repeated", "the largest loop again", _at_full(_middle_loop), _take_again),
 ]  # fmt: skip
 STEPS = tuple(CharacterisationStep(*row) for row in _ROWS)

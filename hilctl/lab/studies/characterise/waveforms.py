@@ -123,7 +123,9 @@ def _softened(limits: CharacterisationLimits, keys: Keys, whole_s: float, soft_s
     }
 
 
-def small_multisine(limits: CharacterisationLimits, amplitude: float) -> Keys:
+def small_multisine(
+    limits: CharacterisationLimits, amplitude: float, offset: float | None = None
+) -> Keys:
     """Return a multisine far beyond the band of loops; its period is a whole number of samples."""
     wanted_hz = limits.highest_hz / _LINES_BELOW_TOP
     step_hz = limits.sample_rate_hz / round(limits.sample_rate_hz / wanted_hz)
@@ -135,7 +137,7 @@ def small_multisine(limits: CharacterisationLimits, amplitude: float) -> Keys:
         "first_hz": step_hz,
         "last_hz": _TOP * limits.sample_rate_hz,
         "step_hz": step_hz,
-        "offset": limits.beside_rest(amplitude),
+        "offset": limits.beside_rest(amplitude) if offset is None else offset,
     }
     return _softened(limits, keys, periods / step_hz, 2.0 / step_hz)
 

@@ -19,6 +19,7 @@ from hilctl.lab.identify.field.preprocess import (
     Run,
     smoothed,
 )
+from hilctl.models.linear_stages import Compliance
 
 RATE_HZ = 10_000.0
 LAST = 4850  # sample of 5000 from which on later ones may be missing
@@ -144,6 +145,18 @@ def test_structure_and_delay_come_off_a_sine(delay_s):
     bare = run.bare_um(delay_s, 2.0 * damping * radian_s, radian_s**2)
     assert bare[:130] == pytest.approx(np.sin(turn * t)[kept][:130], abs=2e-4)
     assert run.bare_um(1.0, 0.0, 0.0) == pytest.approx(went.imag[-1])
+
+
+def test_a_structure_by_place_comes_off():
+    """c is 1.5 at -1 um and 0.5 at 1 um."""
+    place = np.linspace(-1.0, 1.0, 5)
+    derivatives = np.stack([place, np.full(5, 2.0), np.full(5, 3.0)])
+    kept, none = np.arange(4), np.zeros(4)
+    compliance = Compliance(lowest_um=-1.0, cell_um=1.0, relative=(1.5, 1.0, 0.5))
+    run = Run(RATE_HZ, kept, none, none, none, derivatives, 0, compliance=compliance)
+    softer = 1.0 - 0.5 * place
+    wanted = place + softer * (0.1 * 2.0 + 0.01 * 3.0)
+    np.testing.assert_allclose(run.bare_um(0.0, 0.1, 0.01), wanted[:4])
 
 
 def test_what_was_found_last_does_not_stand_for_other_arguments():

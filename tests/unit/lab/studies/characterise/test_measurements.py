@@ -10,10 +10,12 @@ from scipy.signal import cont2discrete, lfilter
 from hilctl.base.errors import DataError
 from hilctl.base.segments import Segment
 from hilctl.lab.studies.characterise.measurements import (
+    LocalResonance,
     LoopMetrics,
     RigProblemError,
     all_loops,
     centre_line,
+    compliance_of,
     crept_percent,
     loop_metrics,
     next_amplitude,
@@ -141,6 +143,24 @@ def test_a_resonance_is_found(limits, played):
     assert found.gain_um == pytest.approx(4.0, rel=0.05)
     assert found.size_at(400.0) > 4.0
     assert found.misfit_percent < 10.0
+
+
+def test_a_compliance_follows_from_resonances_that_differ():
+    """It is relative to the first place, and constant beyond the others."""
+    places = [LocalResonance(0.0, 1000.0, 2.0), LocalResonance(-8.0, 800.0, 2.0)]
+    found = compliance_of(places, (-12.0, 4.0))
+    assert (found.lowest_um, found.cell_um) == (-12.0, 1.0)
+    relative = dict(zip(range(-12, 5), found.relative, strict=True))
+    assert relative[-12] == relative[-8] == pytest.approx(1.5625)
+    assert relative[-4] == pytest.approx(1.28125)
+    assert relative[4] == relative[0] == pytest.approx(1.0)
+
+
+@pytest.mark.parametrize("other", [(1020.0, 1.0), (1200.0, 60.0)])
+def test_a_resonance_that_hardly_differs_is_the_same_everywhere(other):
+    places = [LocalResonance(0.0, 1000.0, 2.0), LocalResonance(-8.0, *other)]
+    assert compliance_of(places, (-12.0, 4.0)) is None
+    assert compliance_of(places[:1], (-12.0, 4.0)) is None
 
 
 def test_a_lag_and_a_delay_are_no_resonance(limits, played):

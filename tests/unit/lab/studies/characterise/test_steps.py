@@ -8,7 +8,7 @@ import pytest
 from hilctl.lab.studies.characterise import steps
 from hilctl.lab.studies.characterise.measurements import RigProblemError
 from hilctl.lab.studies.characterise.results import Measured
-from hilctl.lab.studies.characterise.steps import STEPS, full_amplitude
+from hilctl.lab.studies.characterise.steps import RESPONSE_PLACES, STEPS, full_amplitude
 from tests.unit.lab.studies.characterise.conftest import plays
 from tests.unit.lab.studies.characterise.test_measurements import resonator
 
@@ -107,6 +107,24 @@ def test_noise_that_leaves_no_loop(walked, limits):
     """An average shows the motion, but a loop of 1.5 um is hidden by 0.4 um rms."""
     error = problem_of(walked, limits, lambda v: 0.2 * v, noise_um=0.45)
     assert error.code in {"noise", "not_repeatable"}
+
+
+def test_the_resonance_is_measured_over_the_stroke(walked, played, limits):
+    """Rest is the middle of this range, and is measured already."""
+    rods = {part: resonator(600.0 + 90.0 * part, 0.08) for part in RESPONSE_PLACES}
+    measured, _ = walked(limits, lambda v: 4.0 * rods[0.0](v), last="response-1")
+    steps = [step for step in STEPS if step.name.startswith("placed-response")]
+    for part, step in zip(RESPONSE_PLACES, steps, strict=True):
+        keys = step.waveform(limits, measured)
+        assert (keys is None) == (part == 0.0)
+        if keys is not None:
+            rod = rods[part]
+            recording = played(limits, keys, lambda v, rod=rod: 4.0 * rod(v), 0.01)
+            measured, _ = step.take(recording, limits, measured)
+    natural_hz = [at.natural_hz for at in measured.resonances]
+    assert natural_hz == pytest.approx([600.0, 537.0, 663.0], rel=0.02)
+    places = [at.place_um / (4.0 * limits.reach) for at in measured.resonances]
+    assert places == pytest.approx([0.0, -0.7, 0.7], abs=0.01)
 
 
 @pytest.mark.slow
