@@ -10,18 +10,21 @@ from hilctl.base.errors import ModelError
 from hilctl.base.strict import CheckedModel, Field, StrictModel
 from hilctl.base.types import C128, F64
 from hilctl.kernels.dynamics import (
+    bend_block,
     between_block,
     creep_block,
     delay_block,
     mode_block,
     mode_motion,
     place_mode_block,
+    unbend_block,
     uncreep_block,
     unmode_block,
 )
 from hilctl.models.base import Operator, threshold_problems
 
 _WIDEST = 64
+LEAST_SLOPE = 0.1
 
 
 class Chain(Operator):
@@ -106,6 +109,11 @@ TimeConstant = Annotated[float, Field(ge=1e-3, le=1e6)]
 Share = Annotated[float, Field(gt=0.0, le=1.0)]
 
 
+def unbending(bend_per_um: float) -> Operator:
+    """Return the operator from a displacement x = p + b p^2 to p."""
+    return Operator(unbend_block, (bend_per_um, LEAST_SLOPE), 0)
+
+
 class CreepModel(CheckedModel):
     """y = x + c_1 + c_2 + ..., T_i c_i' = s_i x - c_i: creep as springs and dampers in series.
 
@@ -113,13 +121,19 @@ class CreepModel(CheckedModel):
     nonlinearities in smart-material systems", Control and Intelligent Systems 29 (2001) 74. x and y
     are displacements from rest, where creep is 0.
 
+    The strain of a ceramic or a rod is a square of its polarisation or magnetisation, and it is
+    these that creep. With a bend b, so do p and q in x = p + b p^2 and y = q + b q^2.
+
     Attributes:
         time_constants_s: T of each element, rising, in s.
         shares: s of each: final creep relative to a constant displacement.
+        bend_per_um: b, in 1/um; 0 if the displacement itself creeps. Slopes of the square below
+            :data:`LEAST_SLOPE` count as that.
     """
 
     time_constants_s: tuple[TimeConstant, ...] = Field(min_length=1, max_length=16)
     shares: tuple[Share, ...]
+    bend_per_um: float = Field(default=0.0, allow_inf_nan=False)
 
     def _problems(self) -> Iterator[str]:
         yield from threshold_problems("T", self.time_constants_s)
@@ -129,11 +143,20 @@ class CreepModel(CheckedModel):
 
     def forward(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
         """Return the operator that adds creep to displacements, which are ``rest_um`` at rest."""
-        return _CreepOperator(self, creep_block, sample_rate_hz, rest_um)
+        return self._bent(creep_block, sample_rate_hz, rest_um)
 
     def inverse(self, sample_rate_hz: float, rest_um: float = 0.0) -> Operator:
         """Return the exact inverse of :meth:`forward`."""
-        return _CreepOperator(self, uncreep_block, sample_rate_hz, rest_um)
+        return self._bent(uncreep_block, sample_rate_hz, rest_um)
+
+    def _bent(self, kernel: Callable[..., None], sample_rate_hz: float, rest_um: float) -> Operator:
+        if not self.bend_per_um:
+            return _CreepOperator(self, kernel, sample_rate_hz, rest_um)
+        bend = Operator(bend_block, (self.bend_per_um, LEAST_SLOPE), 0)
+        creep = _CreepOperator(self, kernel, sample_rate_hz, 0.0)
+        return Chain(
+            [unbending(self.bend_per_um), creep, bend], input_offset=-rest_um, output_offset=rest_um
+        )
 
     def over(self, seconds: float) -> tuple[F64, F64]:
         """Return the decay of each element over a time, and its gain from x: float64[m] each."""

@@ -1,12 +1,10 @@
 """Fit of a model to records: the model, its errors, its provenance and its identified range.
 
-While the command is constant, neither hysteresis nor settled dynamics move the displacement. So
-creep is fitted to such rests first and removed from the records, and models are fitted to the rest.
+Creep is identified first and removed from the records, and models are fitted to the rest.
 """
 
 import math
 import time
-from collections.abc import Iterator, Sequence
 from dataclasses import asdict, dataclass, replace
 from typing import Any
 
@@ -14,14 +12,12 @@ import numpy as np
 import scipy
 from pydantic import ValidationError
 from scipy.fft import rfft, rfftfreq
-from scipy.optimize import nnls
 
 import hilctl
 from hilctl.base.errors import DataError
-from hilctl.base.types import F64, I64
 from hilctl.experiment.model_validity import ALL, QUIET, spectrum
+from hilctl.lab.identify.creep_spectrum import creep_of, without_creep
 from hilctl.lab.identify.data.records import (
-    FEWEST_POINTS,
     History,
     Record,
     SteadyLoop,
@@ -33,164 +29,9 @@ from hilctl.lab.identify.fit_api import FitJob, FitRequest, FoundModel
 from hilctl.lab.identify.fit_data import FitData
 from hilctl.lab.identify.resonances import without_modes
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
-from hilctl.models.linear_stages import CreepModel
 from hilctl.models.staged import StagedModel
-from hilctl.signals import cycle_metrics
 
 _HELD_S, _HELD_RATE_HZ = 0.1, 10e3  # commands held; rate for records of unknown sample rate
-COARSE_S = 1e-3
-LEAST_REST_S = 0.5
-STILL = 1e-6  # largest change per sample at rest, as a share of the command's range
-SETTLED_S = 0.01  # start of a rest that is ignored, until lags and structures have settled
-SHORTEST_S = 0.03  # time constant
-LONGEST = 10.0  # longest time constant over the longest rest: slower creep looks linear
-APART = 2.0  # ratio of time constants, which approximate any law of creep
-FIRST_S, GROWTH = 0.005, 1.3  # first averaged interval of a rest, and ratio to the next
-ROUNDS = 4  # rounds of a fixed-point iteration: each leaves a few percent of the error
-LEAST_SHARE = 1e-4
-CLEAR = 0.8  # part of the motion during rests that creep must explain
-MOST = 0.5  # maximum total share: a larger one is drift
-LEAST_MOVE = 3e-4  # minimum motion during rests, as a share of the stroke
-
-
-@dataclass(frozen=True, slots=True)
-class _Rest:
-    """An interval of constant command in a history, and edges of its averaged parts."""
-
-    of: int
-    edges: I64
-
-    def means(self, signal: F64) -> F64:
-        """Return the mean of a signal in each part, less their mean: float64[m]."""
-        sums = np.add.reduceat(signal[: self.edges[-1]], self.edges[:-1])
-        means: F64 = sums / np.diff(self.edges)
-        means -= means.mean()
-        return means
-
-
-def creep_of(records: Sequence[Record]) -> CreepModel | None:
-    """Return the creep during rests; None without creep or two rests of 0.5 s."""
-    histories, rests = _resting(records)
-    if len(rests) < 2:
-        return None
-    least_squares = _LeastSquares(histories, rests)
-    creep = None
-    for _ in range(ROUNDS):
-        creep = least_squares.solve([_bare_um(history, creep) for history in histories])
-        if creep is None:
-            return None
-    return creep
-
-
-def creeps(records: Sequence[Record]) -> bool:
-    """Return whether displacements move during rests, other than by heat and drift."""
-    histories, rests = _resting(records)
-    return len(rests) > 1 and _LeastSquares(histories, rests).moves
-
-
-def _resting(records: Sequence[Record]) -> tuple[list[History], list[_Rest]]:
-    """Return coarse histories, and their rests."""
-    histories = [_coarse(record) for record in records if isinstance(record, History)]
-    return histories, [rest for i, each in enumerate(histories) for rest in _rests(i, each)]
-
-
-def without_creep(records: Sequence[Record], creep: CreepModel) -> tuple[Record, ...]:
-    """Return records with creep removed from histories."""
-    return tuple(
-        replace(record, displacement_um=_bare_um(record, creep) + record.displacement_um[0])
-        if isinstance(record, History)
-        else record
-        for record in records
-    )
-
-
-def _coarse(history: History) -> History:
-    """Return a history averaged over milliseconds: creep is slower by far."""
-    together = max(1, int(COARSE_S * history.sample_rate_hz))
-    count = history.command.size // together
-    if together == 1 or count < FEWEST_POINTS:
-        return history
-    whole = np.stack((history.command, history.displacement_um))[:, : count * together]
-    command, displacement_um = whole.reshape(2, count, together).mean(axis=2)
-    return History(history.label, command, displacement_um, history.sample_rate_hz / together)
-
-
-def _rests(number: int, history: History) -> Iterator[_Rest]:
-    """Yield the rests of a history."""
-    rate_hz = history.sample_rate_hz
-    still = np.abs(np.diff(history.command)) <= STILL * np.ptp(history.command)
-    turns = np.flatnonzero(np.diff(np.concatenate(([False], still, [False])).astype(np.int8)))
-    for start, stop in turns.reshape(-1, 2).tolist():
-        if stop - start >= LEAST_REST_S * rate_hz:
-            yield _Rest(number, _edges(start, stop + 1, rate_hz))
-
-
-def _edges(start: int, stop: int, rate_hz: float) -> I64:
-    """Return edges of parts that become longer, as creep becomes slower."""
-    parts = int(np.log1p((stop - start) / rate_hz * (GROWTH - 1.0) / FIRST_S) / np.log(GROWTH))
-    ends_s = SETTLED_S + FIRST_S * (GROWTH ** np.arange(parts + 1) - 1.0) / (GROWTH - 1.0)
-    edges = np.unique(start + np.round(rate_hz * ends_s).astype(np.int64))
-    return np.append(edges[edges < stop], stop)
-
-
-def _bare_um(history: History, creep: CreepModel | None) -> F64:
-    """Return a displacement less its first value and without creep: float64[n]."""
-    y_um: F64 = history.displacement_um - history.displacement_um[0]
-    return y_um if creep is None else creep.inverse(history.sample_rate_hz).process(y_um)
-
-
-class _LeastSquares:
-    """Least-squares fit of shares of given time constants, with heat and drift beside them."""
-
-    def __init__(self, histories: Sequence[History], rests: Sequence[_Rest]) -> None:
-        self._histories, self._rests = histories, rests
-        longest_s = max(
-            (rest.edges[-1] - rest.edges[0]) / histories[rest.of].sample_rate_hz for rest in rests
-        )
-        count = 1 + int(np.log(LONGEST * longest_s / SHORTEST_S) / np.log(APART))
-        self._times_s = SHORTEST_S * APART ** np.arange(count, dtype=np.float64)
-        heat = self._means([np.cumsum(history.command**2) for history in histories])
-        drift = self._means([history.time_s for history in histories])
-        self._others = np.linalg.qr(np.stack((heat, drift), axis=1))[0]
-        measured = self._means([history.displacement_um for history in histories])
-        self._measured_um = self._rest_of(measured)
-        self._least_um = LEAST_MOVE * max(float(np.ptp(each.displacement_um)) for each in histories)
-
-    @property
-    def moves(self) -> bool:
-        """Whether the motion during rests is clear."""
-        # The noise of the shortest parts alone reaches the least motion at low sample rates.
-        return cycle_metrics.rms(self._measured_um) > self._least_um
-
-    def solve(self, bare_um: Sequence[F64]) -> CreepModel | None:
-        """Return the creep of displacements, float64[n] each; None without creep."""
-        moves = np.stack([self._moved(bare_um, time_s) for time_s in self._times_s], axis=1)
-        shares, left = nnls(moves, self._measured_um)
-        explained = 1.0 - (left / max(float(np.linalg.norm(self._measured_um)), 1e-300)) ** 2
-        worth = shares > LEAST_SHARE
-        moved_um = float(np.abs(moves @ shares).max())
-        if explained < CLEAR or shares.sum() > MOST or not moved_um > self._least_um:
-            return None
-        return CreepModel(
-            time_constants_s=tuple(self._times_s[worth].tolist()),
-            shares=tuple(shares[worth].tolist()),
-        )
-
-    def _moved(self, bare_um: Sequence[F64], time_s: float) -> F64:
-        """Return the motion of an element of share 1 during rests: float64[M]."""
-        element = CreepModel(time_constants_s=(time_s,), shares=(1.0,))
-        crept = [
-            element.forward(history.sample_rate_hz).process(x_um) - x_um
-            for history, x_um in zip(self._histories, bare_um, strict=True)
-        ]
-        return self._rest_of(self._means(crept))
-
-    def _means(self, signals: Sequence[F64]) -> F64:
-        return np.concatenate([rest.means(signals[rest.of]) for rest in self._rests])
-
-    def _rest_of(self, means: F64) -> F64:
-        """Return the part that heat and drift do not explain."""
-        return means - self._others @ (self._others.T @ means)
 
 
 def fit_kind(request: FitRequest) -> FoundModel:

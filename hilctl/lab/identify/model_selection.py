@@ -13,11 +13,12 @@ import numpy as np
 
 from hilctl.base.errors import DataError
 from hilctl.base.types import F64
+from hilctl.lab.identify.creep_spectrum import creeps
 from hilctl.lab.identify.data.records import History, Record, Records, SteadyLoop, turning_points
 from hilctl.lab.identify.evaluation import Evaluation, judgement_of, responses_um
 from hilctl.lab.identify.fit_api import FitRequest, OnProgress, ignore_progress
 from hilctl.lab.identify.fit_data import FitData
-from hilctl.lab.identify.fit_model import creeps, fit_kind, fit_model
+from hilctl.lab.identify.fit_model import fit_kind, fit_model
 from hilctl.lab.identify.parallel import MapFunction
 from hilctl.lab.identify.settings import FitSettings, IdentifySettings
 

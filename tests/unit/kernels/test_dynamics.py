@@ -45,6 +45,8 @@ STREAMING = {
     "inverse mode": (unmode_block, (MODE_PARAMETERS,), 2),
     "creep": (creep_block, (PARAMETERS,), 3),
     "inverse creep": (uncreep_block, (PARAMETERS,), 3),
+    "bend": (dynamics.bend_block, (0.2, 0.1), 0),
+    "inverse bend": (dynamics.unbend_block, (0.2, 0.1), 0),
 }
 
 
@@ -76,7 +78,9 @@ def test_any_cut_and_the_input_itself_as_output(name):
     np.testing.assert_array_equal(memory, end)
 
 
-@pytest.mark.parametrize("name", [name for name in STREAMING if "creep" not in name])
+@pytest.mark.parametrize(
+    "name", [name for name in STREAMING if "creep" not in name and "bend" not in name]
+)
 def test_a_constant_passes_from_the_first_sample(name):
     out, _ = stream(name, np.full(50, -3.7))
     np.testing.assert_allclose(out, -3.7, rtol=1e-14)
@@ -203,6 +207,16 @@ def test_what_is_no_displacement_creeps_nowhere(walk, kernel, bad):
     out, _ = run(kernel, values)
     assert not np.isfinite(out[100])
     assert np.isfinite(np.delete(out, 100)).all()
+
+
+@pytest.mark.parametrize("bend", [0.2, -0.2, 1e-12])
+def test_a_bend_rises_everywhere_and_is_undone_to_rounding(bend):
+    p, memory = np.linspace(-30.0, 30.0, 6001), rest_memory(0)
+    y, back = np.empty_like(p), np.empty_like(p)
+    dynamics.bend_block(p, bend, 0.1, memory, y)
+    dynamics.unbend_block(y, bend, 0.1, memory, back)
+    assert np.diff(y).min() > 0.099 * 0.01
+    np.testing.assert_allclose(back, p, rtol=1e-10, atol=1e-10)
 
 
 def test_a_pair_is_what_scipy_makes_of_its_transfer_function(walk):

@@ -153,16 +153,27 @@ def test_a_displacement_that_stays_creeps_on_by_each_share():
     np.testing.assert_allclose(crept[1:], wanted, rtol=0.0, atol=1e-12)
 
 
-def test_inverse_undoes_creep_exactly():
+BENT = CREEP.model_copy(update={"bend_per_um": 0.02})
+
+
+@pytest.mark.parametrize("creep", [CREEP, BENT])
+def test_inverse_undoes_creep_exactly(creep):
     x_um = signal()
-    y_um = CREEP.forward(RATE_HZ).process(x_um)
+    y_um = creep.forward(RATE_HZ).process(x_um)
     assert np.abs(y_um - x_um).max() > 0.01 * np.ptp(x_um)
-    np.testing.assert_allclose(CREEP.inverse(RATE_HZ).process(y_um), x_um, rtol=0.0, atol=1e-10)
+    np.testing.assert_allclose(creep.inverse(RATE_HZ).process(y_um), x_um, rtol=0.0, atol=1e-9)
 
 
-def test_only_what_is_away_from_rest_creeps():
+def test_with_a_bend_the_root_of_the_displacement_creeps():
+    """From x = p + b p^2 with b p = 1 to q + b q^2, for q = 1.06 p."""
+    crept_um = BENT.forward(RATE_HZ).process(np.full(30_000, 100.0))[-1]
+    assert crept_um == pytest.approx(50.0 * 1.06 + 0.02 * (50.0 * 1.06) ** 2, rel=1e-6)
+
+
+@pytest.mark.parametrize("creep", [CREEP, BENT])
+def test_only_what_is_away_from_rest_creeps(creep):
     still = np.full(3000, -7.5)
-    for operator in (CREEP.forward(RATE_HZ, rest_um=-7.5), CREEP.inverse(RATE_HZ, rest_um=-7.5)):
+    for operator in (creep.forward(RATE_HZ, rest_um=-7.5), creep.inverse(RATE_HZ, rest_um=-7.5)):
         np.testing.assert_array_equal(operator.process(still), still)
 
 
