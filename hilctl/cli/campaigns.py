@@ -362,6 +362,9 @@ def _print_learned(learned: IlcResult, files: Mapping[str, Path], folder: Path) 
         for axis, cycle, row, check in cycles
     ]
     print_rich(table(f"learned: {learned.reason}", headings, rows, wrap=True))
+    for (axis, label), bands in learned.residual.items():
+        for band in bands:
+            print(f"given up for {f'{axis} {label}'.strip()}: {band}")
     if contour := _contour([row for row in learned.rows if row.run == 0]):
         print(f"contour error: start {contour}, verified {_contour(learned.check) or '-'}")
     for axis, why in learned.alone.items():

@@ -17,10 +17,13 @@ from hilctl.base.files import TextFiles, write_text
 from hilctl.base.segments import Segment
 from hilctl.base.strict import Field, StrictModel, model_validator
 from hilctl.base.types import C128, CHUNK, F64, I64
-from hilctl.base.yaml import dump, load_document
+from hilctl.base.yaml import Document, dump, load_document
 from hilctl.models.base import HysteresisModel
 from hilctl.models.model_file import model_sha256
 from hilctl.waveforms.build import Reference
+
+RESIDUAL = "residual error: "
+"""Start of the keys of provenance with the frequencies that learning gave up."""
 
 PHASES = 64  # points of a cycle that identify a waveform
 
@@ -97,13 +100,19 @@ class Correction(StrictModel):
     model_sha256: str  # digest of the compensator's model
     coupling_sha256: str | None = None  # digest of the coupling in use; None: none
     cycles: Annotated[tuple[LearnedCycle, ...], Field(min_length=1)]  # one per waveform
-    # experiment, runs, identified delay, versions
+    # experiment, runs, identified delay, residual error, versions
     provenance: Mapping[str, str] = Field(default_factory=dict)
 
     @property
     def of_several_cycles(self) -> bool:
         """Whether a period has several cycles of a waveform."""
         return any(cycle.waveform_cycles for cycle in self.cycles)
+
+    @property
+    def residual(self) -> dict[str, str]:
+        """Frequencies that learning gave up, and why, by the label of the waveform."""
+        provenance = self.provenance.items()
+        return {k.removeprefix(RESIDUAL): v for k, v in provenance if k.startswith(RESIDUAL)}
 
     def added(self, reference: Reference, model: HysteresisModel | None) -> F64:
         """Return the reference of a run plus its correction: float64[n], in um.
@@ -196,6 +205,11 @@ def _alike(a: float, b: float) -> bool:
 def load_correction(path: Path, files: TextFiles | None = None) -> Correction:
     """Read a correction file; raise InputError if it cannot be read or breaks a rule."""
     return load_document(path, files).validate(CorrectionFile).correction
+
+
+def parse_correction(name: str, text: str) -> Correction:
+    """Read a correction from a YAML text; raise ConfigError as :func:`load_correction` does."""
+    return Document(name, text).validate(CorrectionFile).correction
 
 
 def dump_correction(correction: Correction) -> str:

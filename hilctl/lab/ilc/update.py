@@ -185,6 +185,7 @@ class IlcState:
         gain: Share of the error that the next step removes.
         widening: Factor of the bandwidth after an improvement.
         response: Response of the displacement to a change of the correction.
+        limited: Whether a correction was refused since the last improvement.
     """
 
     sample_rate_hz: float
@@ -195,6 +196,7 @@ class IlcState:
     widening: float = _WIDEN
     response: IlcResponse = field(default_factory=IlcResponse)
     trials: tuple[IlcIteration, ...] = ()
+    limited: bool = False
     done: str = ""
 
     @property
@@ -246,7 +248,7 @@ def _learned(before: IlcState, error: CycleScore) -> IlcState:
         base = trial
         gain = min(FULL_GAIN, 1.4 * before.gain)
         reach_hz = min(before.highest_hz, before.reach_hz * before.widening)
-        state = replace(state, gain=gain, reach_hz=reach_hz)
+        state = replace(state, gain=gain, reach_hz=reach_hz, limited=False)
     return replace(state, next_um=_moved(state, base))
 
 
@@ -255,7 +257,8 @@ def refused(before: Sequence[IlcState]) -> tuple[IlcState, ...]:
     if not before[0].trials:
         return tuple(before)
     states = tuple(
-        replace(_backed_off(state, state.closest), gain=0.5 * state.gain) for state in before
+        replace(_backed_off(state, state.closest), gain=0.5 * state.gain, limited=True)
+        for state in before
     )
     if min(state.gain for state in states) < _LEAST_STEP:
         return _ended(states, "at a limit")
@@ -299,21 +302,36 @@ def _response(state: IlcState) -> IlcResponse:
     return fit(_changes(state), (error.strongest_hz, error.answer), state.sample_rate_hz)
 
 
-def _answer(state: IlcState, frequency: F64) -> C128:
-    """Return the mean of fitted and measured responses; the latter include further resonances."""
-    fitted = state.response.at(frequency)
-    total_weight = (_FIT_DOUBT * np.abs(fitted)) ** -2.0
-    total: C128 = total_weight * fitted
+def measured_response(state: IlcState) -> tuple[C128, F64]:
+    """Return the response of each harmonic by its significant changes, and its doubt.
+
+    Shapes: complex128[K + 1], float64[K + 1]. The doubt is a standard deviation; infinite, with a
+    response of 0, without a change.
+    """
+    response, square, total_weight = np.zeros((3, state.next_um.size), dtype=np.complex128)
     for change in _changes(state):
         changed_hz, measured, weight = change.points()
         k = np.rint(changed_hz / change.step_hz).astype(np.int64)
-        total[k] += weight**2 * measured
+        response[k] += weight**2 * measured
+        square[k] += weight**2 * np.abs(measured) ** 2
         total_weight[k] += weight**2
-    return total / total_weight
+    known = total_weight.real > 0.0
+    weight = np.where(known, total_weight.real, 1.0)
+    response /= weight
+    scatter = np.maximum(0.0, square.real / weight - np.abs(response) ** 2)
+    return response, np.where(known, np.sqrt(scatter + 1.0 / weight), np.inf)
+
+
+def _answer(state: IlcState, frequency: F64) -> C128:
+    """Return the mean of fitted and measured responses; the latter include further resonances."""
+    fitted, (measured, doubt) = state.response.at(frequency), measured_response(state)
+    certainty, own = (_FIT_DOUBT * np.abs(fitted)) ** -2.0, doubt**-2.0
+    mean: C128 = (certainty * fitted + own * measured) / (certainty + own)
+    return mean
 
 
 def _moved(state: IlcState, base: IlcIteration) -> C128:
-    """Return the correction one step from that of a run."""
+    """Return the correction one step from the best combination of a run with the others."""
     error = base.error
     frequency = np.arange(error.harmonics_um.size, dtype=np.float64) * error.step_hz
     answer = _answer(state, frequency)

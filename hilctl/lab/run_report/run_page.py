@@ -13,6 +13,7 @@ from hilctl.analysis.run_metrics import RunReport
 from hilctl.base.errors import ConfigError
 from hilctl.base.events import Event
 from hilctl.base.formatting import MISSING, printable, quantity, significant, unit_text
+from hilctl.experiment.sections.correction import parse_correction
 from hilctl.lab.pages import html
 from hilctl.lab.pages.figure_layout import FigureSpec
 from hilctl.lab.run_report import plots
@@ -240,6 +241,9 @@ def _model(recording: Recording) -> Iterator[tuple[str, str]]:
     yield "compensator", f"inverse of a model of kind {kind}"
     if recording.correction_yaml:
         yield "correction", "learned, added to the reference"
+        name = f"{recording.path}: correction.yaml"
+        for label, text in parse_correction(name, recording.correction_yaml).residual.items():
+            yield f"given up for {label}", text
     if recording.coupling_yaml:
         yield "coupling", "crosstalk of the other axes, removed from the reference"
     try:

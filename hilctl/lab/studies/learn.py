@@ -20,6 +20,7 @@ from hilctl.base.types import C128
 from hilctl.base.yaml import setting
 from hilctl.experiment.preflight import CheckedExperiment, CheckedRun
 from hilctl.experiment.sections.correction import (
+    RESIDUAL,
     Correction,
     LearnedCycle,
     fits,
@@ -28,6 +29,7 @@ from hilctl.experiment.sections.correction import (
 )
 from hilctl.experiment.sections.coupling import coupling_sha256
 from hilctl.lab.ilc.cycle import CycleScore, cycle_error, harmonic_count
+from hilctl.lab.ilc.residual import CAUSES, ResidualBand, residual
 from hilctl.lab.ilc.update import IlcIteration, IlcState, best_run, learn, refused
 from hilctl.lab.studies.study import StepStoppedError, Study, StudyRun, StudyStep
 from hilctl.models.model_file import model_sha256
@@ -221,6 +223,7 @@ class IlcResult:
         stop_signal: Number of the signal that stopped it, or 0.
         fault: Whether a run ended by a fault, or could not be run or evaluated.
         alone: Why an axis was left alone, by its name.
+        residual: Error that remains, by the axis and label of a waveform; none at the noise floor.
     """
 
     corrections: Mapping[str, Correction]
@@ -230,6 +233,7 @@ class IlcResult:
     stop_signal: int = 0
     fault: bool = False
     alone: Mapping[str, str] = field(default_factory=dict)
+    residual: Mapping[tuple[str, str], Sequence[ResidualBand]] = field(default_factory=dict)
 
     @property
     def correction(self) -> Correction:
@@ -246,6 +250,10 @@ class IlcResult:
                     "label": cycle.label,
                     "start_percent": cycle.start_percent,
                     "error_percent": cycle.error_percent,
+                    "residual": [
+                        {**asdict(band), "reason": CAUSES[band.cause]}
+                        for band in self.residual.get((axis, cycle.label), ())
+                    ],
                 }
                 for axis, correction in self.corrections.items()
                 for cycle in correction.cycles
@@ -297,6 +305,7 @@ class IlcSession:
         self._learners = [*chain(*self._groups)]
         self._states = [tuple(map(beginning, group)) for group in self._groups]
         self._rows: list[IlcRow] = []
+        self._check_errors: list[CycleScore] = []
         self._refusals: list[str] = []
 
     def study(self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]) -> Study[IlcResult]:
@@ -327,8 +336,9 @@ class IlcSession:
                 self._learners, chain(*self._states), self._best(), strict=True
             )
         ]
-        corrections, rows = self._corrections(learned), tuple(self._rows)
-        return IlcResult(corrections, rows, check, reason, stop_signal, fault, self._alone)
+        bands = self._residual()
+        corrections, rows = self._corrections(learned, bands), tuple(self._rows)
+        return IlcResult(corrections, rows, check, reason, stop_signal, fault, self._alone, bands)
 
     def _runs_until_done(
         self, cycles: int, on_rows: Callable[[Sequence[IlcRow]], None]
@@ -370,7 +380,9 @@ class IlcSession:
         for k, (group, before) in enumerate(zip(self._groups, self._states, strict=True)):
             errors = [each.error(recordings[each.axis]) for each in group]
             contour_percent = _contour(recordings, group)
-            if learning and not before[0].done:
+            if not learning:
+                self._check_errors += errors
+            elif not before[0].done:
                 self._states[k] = learn(before, errors)
             for i, learner in enumerate(group):
                 state, path = self._states[k][i], recordings[learner.axis].path
@@ -388,7 +400,22 @@ class IlcSession:
         """Return the best run of each waveform, the same one for those of a group."""
         return [each.trials[best_run(states)] for states in self._states for each in states]
 
-    def _corrections(self, cycles: Sequence[LearnedCycle]) -> dict[str, Correction]:
+    def _residual(self) -> dict[tuple[str, str], list[ResidualBand]]:
+        """Return the residual error of each waveform, see :class:`IlcResult`."""
+        checks: Sequence[CycleScore | None] = self._check_errors or [None] * len(self._learners)
+        states = chain(*self._states)
+        return {
+            (learner.axis, learner.segment.label): residual(state, best, check)
+            for learner, state, best, check in zip(
+                self._learners, states, self._best(), checks, strict=True
+            )
+        }
+
+    def _corrections(
+        self,
+        cycles: Sequence[LearnedCycle],
+        residual: Mapping[tuple[str, str], Sequence[ResidualBand]] | None = None,
+    ) -> dict[str, Correction]:
         """Return the correction of each learned axis from the cycle of each waveform."""
         found = {}
         for checked in self._checked.axes:
@@ -409,6 +436,8 @@ class IlcSession:
                     if state.trials:
                         delay = state.response.delay_s * rate_hz
                         provenance[f"delay_samples: {cycle.label}"] = f"{delay:.2f}"
+                    if bands := (residual or {}).get((learner.axis, cycle.label)):
+                        provenance[RESIDUAL + cycle.label] = "; ".join(map(str, bands))
             if mine:
                 found[loaded.axis] = Correction(
                     sample_rate_hz=rate_hz,

@@ -8,6 +8,7 @@ import pytest
 from hilctl.base.errors import ConfigError
 from hilctl.cli.campaigns import print_campaign, print_row, sweep_document
 from hilctl.experiment.sections.correction import Correction, LearnedCycle
+from hilctl.lab.ilc.residual import ResidualBand
 from hilctl.lab.studies.campaign.campaign_runner import CampaignResult
 from hilctl.lab.studies.campaign.plan import planned
 from hilctl.lab.studies.campaign.steps import CampaignStep, load_campaign
@@ -164,6 +165,11 @@ def learn(monkeypatch, tmp_path, hilctl):
 def test_exit_code_of_learn(learn, tmp_path, how, code):
     assert learn(**how)[0] == code
     assert (tmp_path / "correction.yaml").is_file()
+
+
+def test_learn_names_the_frequencies_it_gave_up(learn):
+    bands = {("", "sine"): [ResidualBand(700.0, 900.0, 0.2, "uncertain")]}
+    assert "sine: 700 to 900 Hz" in learn(residual=bands)[1]
 
 
 def test_learn_refuses_existing_files(learn, tmp_path):

@@ -11,6 +11,12 @@ import pytest
 from hilctl.analysis.report import summarize
 from hilctl.base.events import Event
 from hilctl.base.segments import Segment
+from hilctl.experiment.sections.correction import (
+    RESIDUAL,
+    Correction,
+    LearnedCycle,
+    dump_correction,
+)
 from hilctl.lab.run_report.run_page import (
     headline,
     model_error,
@@ -224,6 +230,18 @@ def test_provenance_has_date_operator_device_and_settings(described):
     assert rows["limits"] == "peak_current_a 7.07"
     assert rows["overrides"] == "waveform.amplitude=40.8"
     assert rows["model error"] == model_error(load_model(MODEL))
+
+
+def test_provenance_has_what_learning_gave_up(described):
+    zeros = {"reference_um": (0.0,) * 64, "cosine_um": (0.0,), "sine_um": (0.0,)}
+    correction = Correction(
+        sample_rate_hz=10.0,
+        model_sha256="0" * 64,
+        cycles=(LearnedCycle(label="sine", period_samples=10.0, **zeros),),
+        provenance={RESIDUAL + "sine": "700 Hz: why"},
+    )
+    changed = replace(described, correction_yaml=dump_correction(correction))
+    assert dict(provenance_rows(changed))["given up for sine"] == "700 Hz: why"
 
 
 def test_a_model_s_error_on_unseen_data_comes_first():

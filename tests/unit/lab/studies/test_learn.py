@@ -19,6 +19,7 @@ from hilctl.experiment.sections.correction import (
     write_correction,
 )
 from hilctl.lab.ilc.cycle import CycleScore
+from hilctl.lab.ilc.residual import ResidualBand
 from hilctl.lab.ilc.update import IlcState
 from hilctl.lab.studies.learn import (
     HIGHEST_PART,
@@ -73,6 +74,10 @@ def test_each_run_has_the_next_correction_and_noise_of_its_own(tmp_path):
     assert [row.run for row in found.check] == [3]
     assert "2 learning cycles" in found.reason
     assert found.rows[1].error_percent < found.rows[0].error_percent
+    (label,) = found.correction.residual
+    bands = found.residual["", label]
+    assert {band.cause for band in bands} == {"unfinished"}
+    assert found.correction.residual[label] == "; ".join(map(str, bands))
 
 
 @pytest.mark.parametrize("before", [
@@ -153,12 +158,16 @@ def test_programs_get_figures_without_coefficients():
         error_percent=0.5,
     )  # fmt: skip
     correction = Correction(sample_rate_hz=RATE_HZ, model_sha256="0" * 64, cycles=(cycle,))
-    mapping = IlcResult({"": correction}, (ROW, ROW), (ROW,), "done").to_mapping()
+    bands = {("", "sine"): [ResidualBand(700.0, 900.0, 0.2, "uncertain")]}
+    result = IlcResult({"": correction}, (ROW, ROW), (ROW,), "done", residual=bands)
+    mapping = result.to_mapping()
     text = json.dumps(mapping, allow_nan=False)
     assert "cosine" not in text
-    assert mapping["waveforms"] == [
-        {"axis": "", "label": "sine", "start_percent": 4.0, "error_percent": 0.5}
-    ]
+    (waveform,) = mapping["waveforms"]
+    (band,) = waveform.pop("residual")
+    assert waveform == {"axis": "", "label": "sine", "start_percent": 4.0, "error_percent": 0.5}
+    assert (band["low_hz"], band["high_hz"], band["cause"]) == (700.0, 900.0, "uncertain")
+    assert band["reason"]
     assert mapping["reason"] == "done"
 
 
