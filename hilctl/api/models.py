@@ -7,7 +7,7 @@ from functools import cached_property
 from pathlib import Path
 
 from hilctl.api._types import PathLike, Paths, experiment_path, path_or_none, paths_of
-from hilctl.base.errors import InputError
+from hilctl.base.errors import DataError, InputError
 from hilctl.base.files import check_no_input, check_writable, write_text
 from hilctl.base.formatting import shown_briefly
 from hilctl.base.types import CommandUnit
@@ -16,12 +16,14 @@ from hilctl.experiment.load import inputs_of
 from hilctl.lab.comparison import compare as library
 from hilctl.lab.comparison.compare import Comparison
 from hilctl.lab.identify.data.data_files import load_records
+from hilctl.lab.identify.data.records import SteadyLoop
 from hilctl.lab.identify.fit_api import FitRequest, OnProgress
 from hilctl.lab.identify.model_selection import choose_lag
 from hilctl.lab.identify.parallel import MapFunction, workers
 from hilctl.lab.identify.pipeline import (
     Identification,
     as_recorded,
+    as_run,
     identify_records,
     settings_from,
 )
@@ -79,9 +81,38 @@ def identify(
     if chosen.table.find_lag:
         recorded, _ = _request(paths, others, chosen, 0, map, on_progress)
         found = as_recorded(found, recorded, lag)
+    if not chosen.whole:
+        found = _as_run(found, paths, chosen)
     if output is not None and found.verdict.grade != "not a model":
         write_text(Path(output), dump_model(found.fit.model), overwrite=overwrite)
     return replace(found, lag_samples=lag, understood=understood)
+
+
+MOST_SAMPLES = 10_000_000
+"""Maximum samples of recordings that are evaluated as a whole beside their loops."""
+
+
+def _as_run(
+    found: Identification, paths: Sequence[Path], settings: IdentifySettings
+) -> Identification:
+    """Return an identification with the verdict on whole recordings too, or a note why not."""
+    recordings = [path for path in paths if path.suffix.lower() == ".mcap"]
+    loops = [each for each in found.data if isinstance(each, SteadyLoop)]
+    if not recordings or not loops:
+        return found
+    longest = max(loop.start_s * loop.sample_rate_hz for loop in loops)
+    reason = "some loops are omitted" if settings.leave_out else ""
+    if longest * len(recordings) > MOST_SAMPLES:
+        reason = f"the recordings have more than {MOST_SAMPLES:,} samples"
+    if not reason:
+        whole = settings.model_copy(update={"whole": True})
+        try:
+            return as_run(found, load_records(recordings, whole, 0).records, settings)
+        except DataError as error:
+            reason = str(error)
+    note = f"only steady cycles were evaluated, not the motion from rest to them: {reason}"
+    verdict = replace(found.verdict, notes=(*found.verdict.notes, note))
+    return replace(found, verdict=verdict)
 
 
 def _request(

@@ -26,6 +26,7 @@ EVEN = 0.5  # correlation with the command's distance from its middle
 LIKELY_UM = 500.0
 CONSTANT = 0.75  # part of the mean square error that is a constant
 CLEAR_PERCENT = 0.5
+CENTRAL = 0.1  # of the largest span of a command: least distance of the middles of loops
 
 
 @dataclass(frozen=True, slots=True)
@@ -119,6 +120,12 @@ def verdict_of(
     # its plays follow a whole history up to the largest swing, which determines smaller ones.
     histories = not any(isinstance(record, SteadyLoop) for record in records)
     known = not notes or (histories and settings.kind == "ppi")
+    if settings.kind != "ppi" and _central(records):
+        known = False
+        notes.append(
+            "all loops have one middle, so smaller motions elsewhere are unknown: add loops about "
+            "other middles"
+        )
     if held_out is None:
         notes.append(
             "no data were held out: use four loops or more at several amplitudes and frequencies, "
@@ -128,6 +135,14 @@ def verdict_of(
         notes.insert(0, text)
     notes += suggestions
     return verdict_on(classes, known=known, held_out=held_out is not None, notes=notes)
+
+
+def _central(records: Sequence[Record]) -> bool:
+    """Return whether all records are steady loops about one command."""
+    spans = [float(np.ptp(record.command)) for record in records]
+    middles = [0.5 * float(each.command.min() + each.command.max()) for each in records]
+    steady = all(isinstance(record, SteadyLoop) for record in records)
+    return steady and float(np.ptp(middles)) < CENTRAL * max(spans)
 
 
 def _fit_reasons(

@@ -3,6 +3,7 @@
 from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from datetime import UTC, datetime
+from functools import partial
 from typing import Any
 
 from hilctl.base.formatting import shown_briefly
@@ -22,7 +23,7 @@ from hilctl.lab.identify.model_selection import (
 )
 from hilctl.lab.identify.registry import fit_named
 from hilctl.lab.identify.resonances import WORTH, further_modes
-from hilctl.lab.identify.settings import IdentifySettings
+from hilctl.lab.identify.settings import FitSettings, IdentifySettings
 from hilctl.models.linear_stages import FirstMode, FurtherMode
 
 TURNS = 4  # each identifies a new model
@@ -150,19 +151,22 @@ def identify_records(request: FitRequest) -> Identification:
         update["errors_percent"] = {**fit.model.provenance.errors_percent, **figures}
     fit = _with_provenance(fit, update)
 
-    def refit(others: Sequence[Record]) -> tuple[float, float] | None:
-        asked = replace(request, records=others, settings=selection.settings)
-        if best.held_out is None:
-            return best.fit.rms_percent, fit_model(asked).rms_percent
-        again = held_out_error(asked)
-        if again is None:
-            return None
-        return best.held_out.judgement.rms_percent, again.judgement.rms_percent
-
+    refit = partial(_refit_errors, best, replace(request, settings=selection.settings))
     verdict = verdict_of(fit, records, selection.settings, held_out, refit)
     verdict = replace(verdict, notes=(*verdict.notes, *cost))
     identification = Identification(fit, records, verdict, held_out, 0, selection.candidates)
     return with_verdict(identification, verdict)
+
+
+def _refit_errors(
+    best: ModalFit, request: FitRequest, records: Sequence[Record]
+) -> tuple[float, float] | None:
+    """Return the rms error, on held-out parts if any, and that of a new fit to other records."""
+    asked = replace(request, records=records)
+    if best.held_out is None:
+        return best.rms_percent, fit_model(asked).rms_percent
+    again = held_out_error(asked)
+    return None if again is None else (best.rms_percent, again.judgement.rms_percent)
 
 
 STRUCTURE = {"natural_hz", "damping_ratio"}
@@ -211,6 +215,26 @@ def as_recorded(found: Identification, request: FitRequest, lag_samples: int) ->
     known, held_out = found.verdict.grade == "good", found.verdict.held_out
     notes = (note, *found.verdict.notes)
     return with_verdict(found, verdict_on(classes, known=known, held_out=held_out, notes=notes))
+
+
+def as_run(found: Identification, runs: Sequence[Record], settings: FitSettings) -> Identification:
+    """Return an identification with the verdict on whole runs too, whose loops were fitted.
+
+    The steady cycles of loops show neither the first cycles nor the paths between the loops.
+    """
+    verdict = found.verdict
+    if verdict.grade == "not a model":
+        return found
+    judged = judge(
+        found.fit.model, runs, stroke_um=FitData(found.data).stroke_um,
+        highest_hz=settings.highest_hz,
+    )  # fmt: skip
+    classes = largest_errors(verdict.classes, judged.classes)
+    known = verdict.grade == "good"
+    return with_verdict(
+        found,
+        verdict_on(classes, known=known, held_out=verdict.held_out, notes=verdict.notes),
+    )
 
 
 def with_verdict(found: Identification, verdict: Verdict) -> Identification:

@@ -10,7 +10,7 @@ from hilctl.lab.identify import pipeline
 from hilctl.lab.identify.data.records import History
 from hilctl.lab.identify.fit_api import FitRequest
 from hilctl.lab.identify.model_selection import alike_loops
-from hilctl.lab.identify.pipeline import as_recorded, identify_records
+from hilctl.lab.identify.pipeline import as_recorded, as_run, identify_records
 from hilctl.lab.identify.settings import FitSettings
 from hilctl.models.model_file import dump_model, parse_model
 from hilctl.models.plays import PpiModel
@@ -124,6 +124,23 @@ def test_what_a_campaign_can_t_know_is_said_and_nothing_is_good(grid, chosen, no
     assert any(note in each for each in verdict.notes)
 
 
+def test_loops_about_one_command_are_good_for_a_ppi_at_most(grid):
+    settings = FitSettings(kind="rdpi", plays=3, starts=1, weight_by="equal")
+
+    def verdict(records):
+        return identify_records(FitRequest(records, settings, "A")).verdict
+
+    central = verdict(grid)
+    assert central.grade == "usable"
+    assert any("other middles" in note for note in central.notes)
+    small = grid[0]
+    moved = replace(
+        small, command=small.command + 3.0, displacement_um=small.displacement_um + 18.0
+    )
+    aside = verdict([*grid, moved])
+    assert not any("other middles" in note for note in aside.notes)
+
+
 def test_the_cause_of_an_error_is_named_before_a_model_is_poor(grid):
     clipped = changed(grid, lambda y: np.minimum(y, 29.2))
     verdict = judged(clipped).verdict
@@ -218,6 +235,23 @@ def test_the_promise_includes_a_lag_that_the_model_does_not_have():
     assert errors == {each.label: each.peak_percent for each in found.verdict.classes}
     assert errors["full stroke"] == pytest.approx(written_percent(found.fit.model, late), rel=0.3)
     assert as_recorded(shifted, request, 0) is shifted
+
+
+def test_the_promise_includes_the_motion_from_rest_to_the_loops(grid):
+    """Steady cycles do not show an offset that the first cycles have."""
+    found = judged(grid)
+    time_s = np.arange(2000) / 1000.0
+    command = 6.0 * np.sin(20.0 * np.pi * time_s)
+    displacement_um = TRUTH.forward(1000.0).process(command)
+    settings = FitSettings(kind="ppi")
+    same = as_run(found, [History("run", command, displacement_um, 1000.0)], settings)
+    assert same.verdict.grade == "good"
+    crept_um = displacement_um + 16.0 * np.exp(-time_s / 0.5)
+    later = as_run(found, [History("run", command, crept_um, 1000.0)], settings)
+    assert later.verdict.grade == "poor"
+    provenance = later.fit.model.provenance
+    assert provenance.errors_by_stroke["full stroke"] == later.verdict.within_percent > 5.0
+    assert "'run'" in provenance.worst_by_stroke["full stroke"]
 
 
 def test_a_structure_at_a_bound_is_left_out_or_its_worth_is_said(monkeypatch):
