@@ -204,7 +204,8 @@ class _Path:
         """Return each play's output per spline in each window: float64[n, m]."""
         size = self.command.size
         held, by = np.empty((2, thresholds.size, size))
-        play_paths(self.command, np.zeros(size), thresholds, 0.0, 0.0, np.arange(size), held, by)
+        rows = np.arange(size)
+        play_paths(self.command, np.zeros(size), thresholds, 0.0, 0.0, 0.0, rows, held, by)
         out = np.empty((size // self.together, thresholds.size, SPLINES))
         columns = np.empty((size, SPLINES))
         for i in range(thresholds.size):
