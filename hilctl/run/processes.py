@@ -31,6 +31,7 @@ _DEATH_S = 0.1
 _END_S = 1.0
 _ACT_S = 10.0
 _CLOSE_S = 40.0  # in which a guardian ends its last write, and closes its device
+_TOLD_S = 1.0  # a wait that is longer is reported
 _POLL_S = 0.01
 
 
@@ -223,9 +224,14 @@ class GuardianRelief:
 
         ``check`` is called repeatedly, and may raise an error to give up.
         """
-        deadline_s = time.monotonic() + _CLOSE_S
-        while self.runs and locks.holder() and time.monotonic() < deadline_s:
+        began_s, told = time.monotonic(), False
+        while self.runs and (name := locks.holder()) and time.monotonic() < began_s + _CLOSE_S:
             check()
+            if not told and time.monotonic() > began_s + _TOLD_S:
+                named = ", ".join(run.card.name for run in self.runs)
+                text = "waiting until the guardian of %s releases %s, at most %g s"
+                _log.warning(text, named, name, _CLOSE_S)
+                told = True
             for _, (page, *_) in self._runs:
                 page.put(PageField.CLAIM, 1)
             time.sleep(_POLL_S)

@@ -150,12 +150,15 @@ def test_a_device_is_claimed_until_its_guardian_has_released_it(left, sleeping):
     assert page.get(PageField.RELIEVED) == 0
 
 
-def test_waiting_for_a_guardian_has_a_limit(left, sleeping):
-    left()
+def test_waiting_for_a_guardian_has_a_limit_and_is_reported_once(left, sleeping, caplog):
+    run, _ = left()
     with held_devices([HOLDS]), DeviceLocks([HOLDS]) as locks:
         relief = GuardianRelief([PLACE])
         with pytest.raises(InputError, match=f"{HOLDS} is in use"):
             relief.acquire(locks)
+        (told,) = caplog.messages
+        assert run.card.name in told
+        assert HOLDS in told
         with pytest.raises(RunError, match="stopped"):
             relief.acquire(locks, Mock(side_effect=RunError("stopped")))
 
