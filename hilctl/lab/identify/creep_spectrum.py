@@ -2,20 +2,22 @@
 
 Creep is told from hysteresis by time: plays of the command do not depend on it. So displacements,
 averaged over milliseconds, are fitted by plays with densities that depend on the place, and by
-elements of creep beside them, in one non-negative least squares. It has a free offset per record,
-a lag, heat and drift. All motions count, not only rests: the means of loops wander as creep does.
+elements of creep beside them, in one non-negative least squares, with lag, heat, drift and offsets.
+All motions count, not only rests: the means of loops wander as creep does.
 
 While the command is constant, neither hysteresis nor settled dynamics move the displacement. So
 rests tell whether there is creep, and whether the result explains it.
 """
 
+import math
 from collections.abc import Iterator, Sequence
 from dataclasses import dataclass, replace
 from functools import cached_property
+from itertools import compress
 from typing import NamedTuple
 
 import numpy as np
-from scipy.linalg import cholesky, solve_triangular
+from scipy.linalg import block_diag, cholesky, solve_triangular
 from scipy.optimize import minimize_scalar, nnls
 
 from hilctl.base.types import F64, I64, Mask
@@ -40,11 +42,16 @@ PLAYS, SPLINES = 16, 8
 NARROW, WIDE = 0.02, 0.8  # thresholds of the plays, of half the range
 SHORTEST_S = 0.01  # time constant
 APART = 10.0**0.5  # ratio of time constants, which approximate any law of creep
-ROUNDS = 3  # of a fixed-point iteration: each leaves a few percent of the error
+ROUNDS = 5  # of a fixed-point iteration: each leaves a few percent of the error
 SURE, UNSURE = 1e-3, 0.05  # error of a window: of the stroke, and of the motion within it
 RIDGE = 1e-6
+FAST_S = 0.02  # longest time constant that may be that of losses
+SYSTEMATIC = 0.1  # weight of motions per inverse error: unlike noise, that of plays repeats
+LEAST_TRUST = 1e-4
 LEAST_SHARE = 1e-4
 MOST = 0.5  # maximum total share: a larger one is drift
+EARLIER_S = 0.2  # shortest time constant of what earlier motions leave
+SHARED = 3  # columns that all records share: lag, heat, drift
 BENT = 0.5  # unexplained motion during rests with a bend, over the one without, if creep is bent
 MOST_BENT = 10.0  # largest bend, per stroke
 
@@ -70,11 +77,23 @@ def creep_of(records: Sequence[Record]) -> CreepModel | None:
     if not rests.move:
         return None
     spectrum = _Spectrum([record for record in records if isinstance(record, History)])
-    found = [spectrum.solve(bend) for bend in (0.0, spectrum.bend())]
+    straight = spectrum.solve(0.0)
+    found = [straight, spectrum.solve(spectrum.bend())]
     left = [1.0 if creep is None else rests.unexplained(creep) for creep in found]
     # A bend may also suit the shape of the hysteresis, of which rests show nothing.
     best = int(left[1] < BENT * left[0])
     return found[best] if left[best] < UNCLEAR else None
+
+
+def without_fastest(creep: CreepModel) -> CreepModel | None:
+    """Return creep without elements as fast as losses may be; None if there are no others."""
+    slow = [time_s > FAST_S for time_s in creep.time_constants_s]
+    if not any(slow):
+        return None
+    kept = {
+        name: tuple(compress(getattr(creep, name), slow)) for name in ("time_constants_s", "shares")
+    }
+    return creep.model_copy(update=kept)
 
 
 def creeps(records: Sequence[Record]) -> bool:
@@ -104,9 +123,10 @@ def _coarse(history: History) -> History:
 
 
 def _averaged(signal: F64, together: int) -> F64:
-    """Return the means of so many samples each: float64[n]."""
-    count = signal.size // together
-    return np.asarray(signal[: count * together].reshape(count, together).mean(axis=1))
+    """Return the means of so many samples each."""
+    count = len(signal) // together
+    parts = signal[: count * together].reshape(count, together, *signal.shape[1:])
+    return np.asarray(parts.mean(axis=1))
 
 
 def _rests(number: int, history: History) -> Iterator[_Rest]:
@@ -178,7 +198,7 @@ class _Path:
     """A history in steps of its command, of which some make a window."""
 
     command: F64
-    displacement_um: F64  # less the first value
+    displacement_um: F64
     rate_hz: float
     together: int  # steps of a window
     kept: Mask  # whether a window is evaluated
@@ -191,14 +211,32 @@ class _Path:
         whole = step * together
         left_out = _averaged((~history.evaluated()).astype(np.float64), whole)
         count = left_out.size * whole
-        y_um = history.displacement_um[:count] - history.displacement_um[0]
+        y_um = _averaged(history.displacement_um[:count], step)
         command = _averaged(history.command[:count], step)
         rate_hz = history.sample_rate_hz / step
-        return cls(command, _averaged(y_um, step), rate_hz, together, left_out == 0.0)
+        return cls(command, y_um, rate_hz, together, left_out == 0.0)
+
+    @property
+    def time_s(self) -> F64:
+        """Time of each step: float64[m]."""
+        return np.arange(self.command.size) / self.rate_hz
 
     def means(self, signal: F64) -> F64:
         """Return the mean of a signal in each window: float64[n]."""
         return _averaged(signal, self.together)
+
+    def rests(self) -> F64:
+        """Return which windows are of each rest, without its start: float64[n, rests]."""
+        moves = np.abs(np.diff(self.command, prepend=np.nan))
+        windows = ~(_averaged(moves, self.together) > STILL * np.ptp(self.command))
+        turns = np.flatnonzero(np.diff(np.concatenate(([0], windows, [0]))))
+        least = LEAST_REST_S * self.rate_hz / self.together
+        settled = math.ceil(SETTLED_S * self.rate_hz / self.together)
+        found = [each for each in turns.reshape(-1, 2).tolist() if each[1] - each[0] >= least]
+        of = np.zeros((windows.size, len(found)))
+        for k, (start, stop) in enumerate(found):
+            of[start + settled : stop, k] = 1.0
+        return of
 
     def plays(self, thresholds: F64, lowest: float, span: float) -> F64:
         """Return each play's output per spline in each window: float64[n, m]."""
@@ -215,10 +253,12 @@ class _Path:
 
 
 class _Fitted(NamedTuple):
-    """Shares of all time constants, and the root of the weighted mean square error in um."""
+    """Result of least squares."""
 
-    shares: F64
-    error_um: float
+    shares: F64  # of all time constants
+    error_um: float  # root of the weighted mean square
+    offset_um: float  # of histories that depend on earlier motion
+    trust: float  # weight of motions, of that of rests
 
 
 class _Spectrum:
@@ -229,9 +269,18 @@ class _Spectrum:
         window_s = max(WINDOW_S, sum(lengths_s) / MOST_WINDOWS)
         self._paths = [_Path.of(history, window_s) for history in histories]
         self._kept = np.concatenate([path.kept for path in self._paths])
+        self._rests_um = np.array([float(history.displacement_um[0]) for history in histories])
+        self._unknown = np.array([history.ignore > 0 for history in histories])
+        if self._unknown.any():
+            self._rests_um[self._unknown] = self._rests_um[self._unknown].mean()
         shortest_s = max(SHORTEST_S, 2.0 * window_s)
         count = 1 + max(0, int(np.log(max(lengths_s) / shortest_s) / np.log(APART)))
         self._times_s = shortest_s * APART ** np.arange(count, dtype=np.float64)
+        # Before the first evaluated sample, shorter time constants have decayed.
+        first_s = np.array(
+            [max(each.ignore / each.sample_rate_hz, EARLIER_S) for each in histories]
+        )
+        self._late = self._unknown[:, None] & (self._times_s > first_s[:, None])
         low = min(float(path.command.min()) for path in self._paths)
         reach = 0.5 * (max(float(path.command.max()) for path in self._paths) - low)
         thresholds = reach * np.append(0.0, np.geomspace(NARROW, WIDE, PLAYS - 1))
@@ -239,11 +288,14 @@ class _Spectrum:
         plays = np.concatenate([path.plays(*grid) for path in self._paths])[self._kept]
         moved = np.ptp(plays, axis=0)
         self._plays = plays[:, moved > SURE * float(moved.max())]
-        y_um = [path.displacement_um for path in self._paths]
+        pairs = zip(self._paths, self._rests_um, strict=True)
+        y_um = [path.displacement_um - rest_um for path, rest_um in pairs]
         self._stroke_um = max(map(np.ptp, y_um))
         self._ends_um = min(map(np.min, y_um)), max(map(np.max, y_um))
         parts = [y.reshape(-1, path.together) for y, path in zip(y_um, self._paths, strict=True)]
         within_um = np.concatenate([np.ptp(part, axis=1) for part in parts])[self._kept]
+        self._rests = block_diag(*(path.rests() for path in self._paths))
+        self._still = self._rests[self._kept].any(axis=1)
         self._weight = 1.0 / (1.0 + UNSURE / SURE * within_um / self._stroke_um)
 
     def bend(self) -> float:
@@ -260,61 +312,85 @@ class _Spectrum:
 
     def solve(self, bend: float) -> CreepModel | None:
         """Return the creep; None without creep."""
-        creep = None
+        found = None
         for _ in range(ROUNDS):
-            shares = self._fit(bend, creep).shares
-            worth = shares > LEAST_SHARE
-            if not worth.any() or shares.sum() > MOST:
+            found = self._fit(bend, found)
+            if not (found.shares > LEAST_SHARE).any() or found.shares.sum() > MOST:
                 return None
-            creep = CreepModel(
-                time_constants_s=tuple(self._times_s[worth].tolist()),
-                shares=tuple(shares[worth].tolist()),
-                bend_per_um=bend,
-            )
-        return creep
+            # The offset is small, so that a bend hardly changes it.
+            self._rests_um[self._unknown] += found.offset_um
+        assert found is not None
+        return self._creep(found, bend)
 
-    def _fit(self, bend: float, creep: CreepModel | None = None) -> _Fitted:
-        """Return the best shares, given those of a round before."""
-        unbent = [unbending(bend).process(path.displacement_um) for path in self._paths]
+    def _creep(self, found: _Fitted, bend: float = 0.0) -> CreepModel:
+        worth = found.shares > LEAST_SHARE
+        return CreepModel(
+            time_constants_s=tuple(self._times_s[worth].tolist()),
+            shares=tuple(found.shares[worth].tolist()),
+            bend_per_um=bend,
+        )
+
+    def _fit(self, bend: float, before: _Fitted | None = None) -> _Fitted:
+        """Return the best shares, given the result of a round before."""
+        pairs = zip(self._paths, self._rests_um, strict=True)
+        unbent = [unbending(bend).process(path.displacement_um - rest) for path, rest in pairs]
         bare = unbent
-        if creep is not None:
-            straight = creep.model_copy(update={"bend_per_um": 0.0})
-            pairs = zip(self._paths, unbent, strict=True)
-            bare = [straight.inverse(path.rate_hz).process(y) for path, y in pairs]
+        if before is not None:
+            undone = [self._creep(before).inverse(path.rate_hz) for path in self._paths]
+            bare = [inverse.process(y) for inverse, y in zip(undone, unbent, strict=True)]
         crept = [self._crept(time_s, bare) for time_s in self._times_s.tolist()]
         y = self._means(unbent)
-        weight = self._weight * (1.0 + 2.0 * bend * y)  # of errors in um
-        others = np.linalg.qr(self._others(unbent) * weight[:, None])[0]
-
-        def left(rows: F64) -> F64:
-            return np.asarray(rows - others @ (others.T @ rows))
-
-        columns = left(np.column_stack([self._plays, *crept]) * weight[:, None])
-        target = left(y * weight)
+        trust = 1.0 if before is None else before.trust
+        own = self._weight * np.where(self._still, 1.0, trust)
+        weight = own * (1.0 + 2.0 * bend * y)  # of errors in um
+        others, corner = np.linalg.qr(self._others(unbent) * weight[:, None])
+        columns = np.column_stack([self._plays, *crept]) * weight[:, None]
+        target = y * weight
+        by_others, of_others = others.T @ columns, others.T @ target
+        columns -= others @ by_others
+        target -= others @ of_others
         longest = np.maximum(np.linalg.norm(columns, axis=0), 1e-300)
         columns /= longest
         normal = columns.T @ columns
         normal[np.diag_indices_from(normal)] += RIDGE
-        corner = cholesky(normal)
+        factor = cholesky(normal)
         found, _ = nnls(
-            corner,
-            solve_triangular(corner, columns.T @ target, trans=1),
+            factor,
+            solve_triangular(factor, columns.T @ target, trans=1),
             maxiter=100 * longest.size,
         )
         error = target - columns @ found
-        error_um = float(np.sqrt(error @ error / (self._weight @ self._weight)))
-        return _Fitted((found / longest)[-self._times_s.size :], error_um)
+        error_um = float(np.sqrt(error @ error / (own @ own)))
+        still, moving = (cycle_metrics.rms(error[at]) for at in (self._still, ~self._still))
+        trust = float(np.clip(SYSTEMATIC * still * trust / max(moving, 1e-300), LEAST_TRUST, 1.0))
+        found /= longest
+        free = solve_triangular(corner, of_others - by_others @ found)
+        offset_um = float(free[SHARED]) if self._unknown.any() else 0.0
+        return _Fitted(found[-self._times_s.size :], error_um, offset_um, trust)
 
     def _others(self, unbent: Sequence[F64]) -> F64:
-        """Return what else moves a displacement: float64[n, k]."""
+        """Return what else moves a displacement: float64[n, k].
+
+        Lag, heat and drift; an offset per history, which those that depend on earlier motion share,
+        and their earlier creep; an offset per rest, since plays hardly predict where it is.
+        """
         paths = self._paths
         lag = [np.gradient(path.means(y)) for path, y in zip(paths, unbent, strict=True)]
         heat = [path.means(np.cumsum(path.command**2) / path.rate_hz) for path in paths]
-        drift = [np.arange(path.kept.size) * path.together / path.rate_hz for path in paths]
-        shared = [np.concatenate(part)[self._kept] for part in (lag, heat, drift)]
-        number = np.repeat(np.arange(len(paths)), [path.kept.size for path in paths])[self._kept]
-        offsets = number[:, None] == np.arange(len(paths))
-        return np.asarray(np.column_stack([*shared, offsets]))
+        drift = [path.means(path.time_s) for path in paths]
+        shared = np.stack([np.concatenate(part) for part in (lag, heat, drift)], axis=1)
+        number = np.repeat(np.arange(len(paths)), [path.kept.size for path in paths])
+        within = number[:, None] == np.arange(len(paths))
+        parts = [shared]
+        if self._unknown.any():
+            parts.append(within[:, self._unknown].any(axis=1, keepdims=True))
+            for path, late, own in zip(paths, self._late, within.T, strict=True):
+                earlier = np.zeros((number.size, int(late.sum())))
+                decays = np.exp(-path.time_s[:, None] / self._times_s[late])
+                earlier[own] = _averaged(decays, path.together)
+                parts.append(earlier)
+        parts.append(within[:, ~self._unknown])
+        return np.asarray(np.hstack([*parts, self._rests])[self._kept])
 
     def _crept(self, time_s: float, bare: Sequence[F64]) -> F64:
         """Return the creep of an element of share 1: float64[n]."""

@@ -16,7 +16,7 @@ from scipy.fft import rfft, rfftfreq
 import hilctl
 from hilctl.base.errors import DataError
 from hilctl.experiment.model_validity import ALL, QUIET, spectrum
-from hilctl.lab.identify.creep_spectrum import creep_of, without_creep
+from hilctl.lab.identify.creep_spectrum import creep_of, without_creep, without_fastest
 from hilctl.lab.identify.data.records import (
     History,
     Record,
@@ -29,17 +29,32 @@ from hilctl.lab.identify.fit_api import FitJob, FitRequest, FoundModel
 from hilctl.lab.identify.fit_data import FitData
 from hilctl.lab.identify.resonances import without_modes
 from hilctl.models.base import HysteresisModel, IdentifiedRange, Provenance
+from hilctl.models.linear_stages import CreepModel
 from hilctl.models.staged import StagedModel
 
+FASTEST = 0.95  # error with the fastest elements of creep, over the one without, if they are kept
 _HELD_S, _HELD_RATE_HZ = 0.1, 10e3  # commands held; rate for records of unknown sample rate
 
 
 def fit_kind(request: FitRequest) -> FoundModel:
     """Fit a kind of model to records without creep and known modes, which become its parts."""
+    settings = request.settings
+    linear = settings.looks_for("creep_stage") and not settings.looks_for("activation")
+    creep = creep_of(request.records) if linear else None
+    found = _fit_with(request, creep)
+    slow = None if creep is None else without_fastest(creep)
+    if slow is None or slow == creep:
+        return found
+    # Rests show the fastest elements hardly, and motions show losses too.
+    other = _fit_with(request, slow)
+    errors = [judge(each.model, request.records).stroke_percent for each in (found, other)]
+    return found if errors[0] < FASTEST * errors[1] else other
+
+
+def _fit_with(request: FitRequest, creep: CreepModel | None) -> FoundModel:
+    """Fit a kind of model with known creep."""
     records, settings, unit = request.records, request.settings, request.unit
     modes = request.modes if settings.looks_for("modes") else ()
-    linear = settings.looks_for("creep_stage") and not settings.looks_for("activation")
-    creep = creep_of(records) if linear else None
     bare = records if creep is None else without_creep(records, creep)
     bare = without_modes(bare, modes) if modes else bare
     data = FitData(bare if settings.fit.has_lag else thinned(bare), unit)
