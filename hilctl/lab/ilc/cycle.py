@@ -84,12 +84,10 @@ def cycle_error(
     step_hz = recording.sample_rate_hz / segment.period
     count = harmonic_count(segment.period, step_hz, highest_hz)
     each = _each_cycle(recording.path, part, segment, count)
-    # Successive cycles, because a drift within a run repeats in the next one, and can be learned.
-    scatter = np.sqrt(np.mean(np.abs(np.diff(each, axis=0)) ** 2, axis=0) / (2.0 * len(each)))
     strongest_hz, answer = _answer(part, segment, step_hz, waveform_cycles)
     return CycleScore(
         harmonics_um=each.mean(axis=0),
-        noise_um=scatter,
+        noise_um=_scatter_um(each),
         step_hz=step_hz,
         cycles=part.cycles,
         peak_um=cycle_metrics.peak(displacement - reference),
@@ -117,6 +115,19 @@ def _each_cycle(path: Path, part: SteadyPart, segment: Segment, count: int) -> C
     if len(whole) < _FEWEST_CYCLES:
         raise DataError(f"{path}: {segment.label}: samples are missing in nearly every cycle")
     return np.array([coefficients(since[r], segment.period, error[r], count) for r in whole])
+
+
+def _scatter_um(each: C128) -> F64:
+    """Return the standard deviation of the mean of cycles, complex128[cycles, n]: float64[n].
+
+    Second differences, and their median, contain no drift or creep within a run. It repeats in the
+    next run, and can be learned.
+    """
+    order = min(2, len(each) - 1)
+    change = np.median(np.abs(np.diff(each, order, axis=0)) ** 2, axis=0)
+    variance = change / (math.log(2.0) * math.comb(2 * order, order))  # of an exponential law
+    scatter: F64 = np.sqrt(variance / len(each))
+    return scatter
 
 
 def _answer(
