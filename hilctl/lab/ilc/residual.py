@@ -25,7 +25,7 @@ _CERTAIN = 0.5
 """Largest doubt of a known response, as a share of it: 30 degrees."""
 
 _MATTERS = 0.1
-"""Smallest share of a band in the power of the residual."""
+"""Smallest share of a band in the power of all, and of all in that of the error."""
 
 _ANOTHER = 0.5
 """Smallest change of a harmonic from run to run that prevents its correction, as a share of it."""
@@ -78,8 +78,10 @@ def residual(state: IlcState, best: IlcIteration, check: CycleScore | None) -> l
         low_hz = size.size * error.step_hz
         bands.append(ResidualBand(low_hz, half, _percent(beyond - white, error), "outside"))
     total = sum(band.rms_percent**2 for band in bands)
-    kept = [band for band in bands if band.rms_percent**2 >= _MATTERS * total]
-    return kept or [ResidualBand(0.0, half, _percent(error.rms_um**2, error), "noise")]
+    rms_percent = _percent(error.rms_um**2, error)
+    if total < _MATTERS * rms_percent**2:
+        return [ResidualBand(0.0, half, rms_percent, "noise")]
+    return [band for band in bands if band.rms_percent**2 >= _MATTERS * total]
 
 
 def _percent(power: float, error: CycleScore) -> float:
