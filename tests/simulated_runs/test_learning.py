@@ -112,6 +112,8 @@ def test_excessive_bandwidth_is_reduced(tmp_path):
     assert "corrections were refused" in learned.reason
     assert "14700 A/s" in learned.reason
     assert min(errors(learned)) < 0.3 * errors(learned)[0]
+    ((*_, band),) = learned.residual.values()
+    assert band.cause == "limit"
 
 
 @pytest.fixture

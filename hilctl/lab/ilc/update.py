@@ -185,7 +185,7 @@ class IlcState:
         gain: Share of the error that the next step removes.
         widening: Factor of the bandwidth after an improvement.
         response: Response of the displacement to a change of the correction.
-        limited: Whether a correction was refused since the last improvement.
+        limited: Whether a correction was refused, which made all later steps smaller.
     """
 
     sample_rate_hz: float
@@ -248,7 +248,7 @@ def _learned(before: IlcState, error: CycleScore) -> IlcState:
         base = trial
         gain = min(FULL_GAIN, 1.4 * before.gain)
         reach_hz = min(before.highest_hz, before.reach_hz * before.widening)
-        state = replace(state, gain=gain, reach_hz=reach_hz, limited=False)
+        state = replace(state, gain=gain, reach_hz=reach_hz)
     return replace(state, next_um=_moved(state, base))
 
 

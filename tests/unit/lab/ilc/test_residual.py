@@ -81,12 +81,3 @@ def test_an_error_above_all_harmonics_is_outside():
 
 def test_an_error_without_a_clear_harmonic_is_noise():
     assert [cause for *_, cause in left(done(), error({7: NOISE_UM}))] == ["noise"]
-
-
-def test_the_next_improvement_ends_a_limit():
-    plant, (state,) = Plant(IlcResponse()), [begun()]
-    (state,) = learn([state], [plant.run(state.next_um)])
-    (state,) = refused([state])
-    assert state.limited
-    (state,) = learn([state], [plant.run(state.next_um)])
-    assert not state.limited
