@@ -65,8 +65,9 @@ def data_reasons(records: Sequence[Record], *, even: bool = False) -> Iterator[s
         return
     if along < AGAINST:
         yield (
-            "the displacement falls when the command rises: swap the wires of the coil, or invert "
-            "the sign of the sensor (--displacement-scale -1 for a table)"
+            "the displacement falls when the command rises: swap the wires of the coil, invert "
+            "the sign of the sensor (--displacement-scale -1 for a table), or correct the timing "
+            "if a table is late by half a cycle (--set table.lag_samples)"
         )
     elif along > 0.0 and float(np.median([_area(record) for record in slow])) < LEADING:
         yield (
