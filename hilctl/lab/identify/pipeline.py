@@ -46,13 +46,14 @@ class ModalFit:
 def with_modes(
     records: Sequence[Record],
     identify: Callable[[Sequence[FurtherMode], Selection | None], ModalFit],
+    measured: Sequence[FurtherMode] = (),
 ) -> ModalFit:
-    """Return a model with the further modes that its records show.
+    """Return a model with the further modes that were measured or that its records show.
 
     A missing mode distorts all other parameters, so a model of the selected kind is identified
     again with each mode that is found, and its residual shows the modes more clearly.
     """
-    best = identify((), None)
+    best = identify(measured, None)
     histories = [record for record in records if isinstance(record, History)]
     if not best.selection.settings.looks_for("modes") or len(histories) < len(records):
         return best
@@ -131,7 +132,7 @@ def identify_records(request: FitRequest) -> Identification:
             held_out = held_out_error(chosen)
         return ModalFit(fit, held_out, selection)
 
-    best, cost = _at_bound(request, with_modes(records, found))
+    best, cost = _at_bound(request, with_modes(records, found, request.modes))
     fit, held_out, selection = best.fit, best.held_out, best.selection
     if validate:
         others = judge(

@@ -53,21 +53,22 @@ def fitted_fields(
     ]
     hold, found = min(fits, key=lambda each: float(each[1].cost))
     fitted = sign * hold * _response(found.x, hz)
-    gain, lag_s = math.exp(found.x[0]), float(found.x[2])
-    mode = [*map(math.exp, found.x[3:5])]
+    x, errors = _lowest_first(found.x, _errors(found))
+    gain, lag_s = math.exp(x[0]), float(x[2])
+    mode = [*map(math.exp, x[3:5])]
     curve_hz = np.geomspace(hz[0], hz[-1], _CURVE_POINTS)
     below = np.flatnonzero(np.abs(_response(found.x, curve_hz)) < gain * math.sqrt(0.5))
     scales = dict(zip(_FITTED, (gain, 1.0, 1.0, *mode), strict=False))
     return {
         "gain_um": sign * gain,
-        "delay_s": float(found.x[1]),
+        "delay_s": float(x[1]),
         "lag_s": lag_s if lag_s * hz[-1] > 1e-3 else 0.0,
         "natural_hz": mode[0] if mode else None,
         "damping_ratio": mode[1] if mode else None,
-        "further": modes_of(found.x[5:]),
+        "further": modes_of(x[5:]),
         "bandwidth_hz": float(curve_hz[below[0]]) if below.size else None,
         "errors": dict(
-            zip(scales, (_errors(found)[: len(scales)] * [*scales.values()]).tolist(), strict=True)
+            zip(scales, (errors[: len(scales)] * [*scales.values()]).tolist(), strict=True)
         ),
         "misfit_percent": 100.0 * float(np.sqrt(np.mean(np.abs(fitted - response) ** 2))) / gain,
         "fitted": fitted,
@@ -87,6 +88,8 @@ def _chosen(hz: F64, response: C128, noise: F64, rate_hz: float) -> OptimizeResu
     ):
         if hz.size <= len(start) + len(added):  # two numbers per line: twice as many as parameters
             break
+        if found.x.size > 3 and _misfit(found) < found.fun.size:
+            break  # the residual is within the doubt of the lines
         worst_hz = hz[np.argmax(np.abs(response / _response(np.array(start), hz) - 1.0))]
         tries = worst_hz, *np.geomspace(2.0 * hz[0], hz[-1], _TRIES).tolist()
         starts = [[*start, math.log(each), *added] for each in tries]
@@ -96,11 +99,28 @@ def _chosen(hz: F64, response: C128, noise: F64, rate_hz: float) -> OptimizeResu
         plausible = natural_hz.max() < hz[-1] and math.exp(more.x[len(start) + 1]) < most_damping
         plausible &= math.exp(more.x[4]) < _MOST_DAMPING
         start = more.x.tolist()
-        if plausible and more.cost < worth * found.cost:
+        if plausible and _misfit(more) < worth * _misfit(found):
             found = more
         elif found.x.size > 3:
             break  # otherwise two modes may explain the misfit of one
     return found
+
+
+def _misfit(found: OptimizeResult) -> float:
+    """Return the sum of squares; a robust one hides the large residual of a missing mode."""
+    return float(np.sum(found.fun**2))
+
+
+def _lowest_first(x: F64, errors: F64) -> tuple[F64, F64]:
+    """Return the parameters with the slowest mode as the first one, and their errors."""
+    x, errors = x.copy(), errors.copy()
+    slowest = min(range(5, x.size, MODE_NUMBERS), key=lambda k: float(x[k]), default=3)
+    if x.size > 3 and x[slowest] < x[3]:
+        x[slowest + 2] += x[slowest] - x[3]  # the antiresonance stays
+        first, other = [3, 4], [slowest, slowest + 1]
+        for each in (x, errors):
+            each[first + other] = each[other + first]
+    return x, errors
 
 
 def _errors(found: OptimizeResult) -> F64:

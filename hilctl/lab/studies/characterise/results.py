@@ -205,6 +205,7 @@ def identified(recordings: Mapping[str, Path], measured: Measured) -> Identifica
                 settings_from("auto", ["structure=false"] if rigid else []),
                 fitted[0].command_unit,
                 structure=structure,
+                modes=measured.small.further if measured.small else (),
                 source=[recording.path.name for recording in fitted],
                 run=run,
             )

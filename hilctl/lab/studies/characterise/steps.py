@@ -39,6 +39,7 @@ _CYCLES = 12.0
 _LOUD_PERCENT = 5.0  # rms noise, of the whole stroke, that hides any motion
 _LEAST_MOTION = 6.0  # peak-to-peak displacement of the largest loop, over the rms noise
 _LEAST_COHERENCE = 0.5  # median of the small-signal response
+_FEW_LINES = 0.25  # share of the lines above the noise: a larger amplitude is tried
 _CLEAR_OF_BAND = 1.5
 _SAFE_OF_RESONANCE = 3.0
 _MOST_SCATTER_PERCENT = 5.0
@@ -149,17 +150,21 @@ def _response(part: float, limits: Limits, measured: Measured) -> Keys | None:
 
 def _take_response(recording: Recording, limits: Limits, measured: Measured) -> Evaluated:
     tried = 0.5 * float(np.ptp(recording.samples.command))
-    last = tried > 0.9 * SMALL_PARTS[-1] * limits.reach
+    largest = tried > 0.9 * SMALL_PARTS[-1] * limits.reach
     part = f"at {100.0 * tried / limits.reach:.2g} % of the range"
     try:
         found = small_signal(recording)
     except RigProblemError as error:
-        if error.code != "noise" or last:
+        if error.code != "noise" or largest:
             raise
         return measured, f"below the noise {part}"
-    if not last and np.median(found.coherence) < _LEAST_COHERENCE:
+    coherence = float(np.median(found.coherence))
+    shown = found.frequency_hz.size / found.excited_lines
+    if not largest and coherence < _LEAST_COHERENCE:
         # A guide with friction hardly moves, or by stick and slip.
-        return measured, f"coherence {np.median(found.coherence):.2g} {part}"
+        return measured, f"coherence {coherence:.2g} {part}"
+    if not largest and shown < _FEW_LINES:
+        return measured, f"{100.0 * shown:.0f} % of the lines are above the noise {part}"
     natural_hz = found.natural_hz
     delay = f"delay {1e3 * found.delay_s:.3g} ms, lag {1e3 * found.lag_s:.3g} ms"
     text = f"gain {found.gain_um:.3g} µm/{limits.unit}, {delay}"
@@ -175,6 +180,7 @@ def _take_response(recording: Recording, limits: Limits, measured: Measured) -> 
             f"set --highest-hz {natural_hz / _SAFE_OF_RESONANCE:.2g} or less, or stiffen the load",
         )
     text += f", resonance {natural_hz:.4g} Hz, damping {found.damping_ratio:.2g}"
+    text += "".join(f"; {mode.natural_hz:.4g} Hz" for mode in found.further)
     return replace(measured, small=found, resonances=places), text
 
 

@@ -181,6 +181,11 @@ def test_modes_that_improve_little_are_left_out(asked, models, modes, rms_percen
     assert (found.modes, found.rms_percent) == ((MODE,) * modes, rms_percent)
 
 
+def test_it_begins_with_measured_modes(monkeypatch):
+    monkeypatch.setattr(subject, "further_modes", lambda *known: None)
+    assert with_modes([RECORD], identifying(Found(1.0)), (MODE,)).modes == (MODE,)
+
+
 def test_it_ends_where_no_mode_shows(monkeypatch):
     asked = []
     monkeypatch.setattr(subject, "further_modes", lambda *known: asked.append(known))

@@ -47,6 +47,19 @@ def test_harmonics_at_weak_lines_do_not_move_a_mode():
     assert found["further"] == ()
 
 
+def test_two_close_modes_are_not_one_of_large_damping():
+    """The slower one is the first; together they are parallel modes of 0.7 and 0.3."""
+    hz = np.arange(50.0, 4000.0, 50.0)
+    response = 0.7 / second_order(hz, 760.0, 0.03) + 0.3 / second_order(hz, 930.0, 0.03)
+    response = response * np.exp(-2j * np.pi * hz * 4e-5)
+    found = fitted_fields(hz, response, np.full(hz.size, 1e-4), RATE_HZ, held=False)
+    assert (found["natural_hz"], found["damping_ratio"]) == pytest.approx((760.0, 0.03), rel=0.01)
+    (other,) = found["further"]
+    assert (other.natural_hz, other.damping_ratio) == pytest.approx((930.0, 0.03), rel=0.01)
+    assert 760.0 < other.antiresonance_hz < 930.0
+    assert found["errors"]["natural_hz"] < 1.0
+
+
 def test_no_mode_beyond_the_lines():
     """A mode that is added may move an earlier one there."""
     hz = np.arange(20.0, 201.0, 20.0)

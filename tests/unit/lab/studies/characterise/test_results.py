@@ -161,11 +161,11 @@ def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkey
     monkeypatch.setattr(results, "read", lambda path: run())
     paths = {name: Path(f"{name}.mcap") for name in [*FITTED, *VALIDATED, "growing-1"]}
     structure = FirstMode(natural_hz=900.0, damping_ratio=0.1)
-    small = SimpleNamespace(structure=structure)
+    small = SimpleNamespace(structure=structure, further=(MODE,))
     assert results.identified(paths, Measured(small=small)) == "found"
     (request,) = asked
     assert request.structure == structure
-    assert request.settings.structure
+    assert (request.settings.structure, request.modes) == (True, (MODE,))
     records, settings, unit = request.records, request.settings, request.unit
     assert len(records) == len(request.source) == len(FITTED)
     assert (settings.auto, settings.whole, unit) == (True, True, "A")
@@ -175,7 +175,7 @@ def test_the_kind_is_chosen_on_whole_histories_of_what_may_be_fitted(run, monkey
     ends = [np.argmin(run().samples.command[:500]), np.argmax(run().samples.command[:500])]
     assert all(record.ignore == max(ends) for record in records)
     monkeypatch.setattr(results, "read", lambda path: run(rest=-1.0))
-    results.identified(paths, Measured(small=SimpleNamespace(structure=None)))
+    results.identified(paths, Measured(small=SimpleNamespace(structure=None, further=())))
     assert not asked[-1].settings.structure
     first = run(rest=-1.0).samples.command[:500]
     assert all(record.ignore == np.argmax(first) > 0 for record in asked[-1].records)
