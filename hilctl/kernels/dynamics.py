@@ -188,10 +188,15 @@ def uncreep_block(y: F64, parameters: F64, memory: F64, out: F64) -> None:
 
 @kernel()
 def bend_block(p: F64, bend: float, least: float, memory: F64, out: F64) -> None:
-    """Compute y = p + bend p^2, which continues straight where its slope is below ``least``."""
+    """Compute y = p + bend p^2, which continues straight where its slope is below ``least``.
+
+    ``memory`` is float64[1]: the previous p.
+    """
     for k in range(p.size):
-        short = least - (1.0 + 2.0 * bend * p[k])
-        out[k] = p[k] + bend * p[k] * p[k]
+        now = p[k]
+        memory[0] = now
+        short = least - (1.0 + 2.0 * bend * now)
+        out[k] = now + bend * now * now
         if short > 0.0:
             out[k] -= 0.25 * short * short / bend
 
@@ -200,11 +205,13 @@ def bend_block(p: F64, bend: float, least: float, memory: F64, out: F64) -> None
 def unbend_block(y: F64, bend: float, least: float, memory: F64, out: F64) -> None:
     """Compute p from y; the inverse of :func:`bend_block`."""
     for k in range(y.size):
-        square = 1.0 + 4.0 * bend * y[k]
+        now = y[k]
+        memory[0] = now
+        square = 1.0 + 4.0 * bend * now
         if square < least * least:
             out[k] = ((square - least * least) / (2.0 * least) + least - 1.0) / (2.0 * bend)
         else:
-            out[k] = 2.0 * y[k] / (1.0 + math.sqrt(square))
+            out[k] = 2.0 * now / (1.0 + math.sqrt(square))
 
 
 # Modes

@@ -28,6 +28,7 @@ from tests.unit.models.literature.test_implicit_models import KP
 from tests.unit.models.test_effective_field import ACTIVATION, field_model
 from tests.unit.models.test_generalised_duhem import duhem_model
 from tests.unit.models.test_integrated import butterfly
+from tests.unit.models.test_linear_stages import BENT
 from tests.unit.models.test_refined import refined, residual
 from tests.unit.models.test_staged import OMEGA, STAGES
 
@@ -56,6 +57,7 @@ CASES = {
     "duhem": KindCase(DUHEM, fit="duhem", fit_percent=0.01),
     "staged": KindCase(StagedModel.around(OMEGA, **STAGES["all"]), inverse_percent=0.1,
                        fit="staged", settings={"plays": 8, "deadbands": 4, "starts": 1}),
+    "bent creep": KindCase(StagedModel.around(OMEGA, creep=BENT)),
     "linear lag": KindCase(StagedModel.around(OMEGA, **STAGES["linear lag"])),
     "structure by place": KindCase(
         StagedModel.around(OMEGA, **STAGES["structure by place"]), inverse_percent=0.1
