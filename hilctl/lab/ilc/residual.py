@@ -55,10 +55,11 @@ class ResidualBand:
 def residual(state: IlcState, best: IlcIteration, check: CycleScore | None) -> list[ResidualBand]:
     """Return the bands of the error that remains with the best correction; none at the noise floor.
 
-    ``check`` is the error of another run with that correction, if there is one.
+    ``check`` is the error of another run with that correction, if there is one. If only that one is
+    above the floor, the bands are those that do not repeat.
     """
     error = check or best.error
-    if error.peak_um <= AT_FLOOR * error.floor_um:
+    if _is_at_floor(error):
         return []
     size = np.abs(error.harmonics_um)
     power = np.where(np.arange(size.size) > 0, 2.0, 1.0) * size**2
@@ -77,11 +78,17 @@ def residual(state: IlcState, best: IlcIteration, check: CycleScore | None) -> l
     if beyond > _CLEAR * white:
         low_hz = size.size * error.step_hz
         bands.append(ResidualBand(low_hz, half, _percent(beyond - white, error), "outside"))
+    if at_floor := _is_at_floor(best.error):
+        bands = [band for band in bands if band.cause == "not_repeatable"]
     total = sum(band.rms_percent**2 for band in bands)
     rms_percent = _percent(error.rms_um**2, error)
     if total < _MATTERS * rms_percent**2:
-        return [ResidualBand(0.0, half, rms_percent, "noise")]
+        return [] if at_floor else [ResidualBand(0.0, half, rms_percent, "noise")]
     return [band for band in bands if band.rms_percent**2 >= _MATTERS * total]
+
+
+def _is_at_floor(error: CycleScore) -> bool:
+    return error.peak_um <= AT_FLOOR * error.floor_um
 
 
 def _percent(power: float, error: CycleScore) -> float:

@@ -45,6 +45,9 @@ def done(**more):
 def test_nothing_remains_at_the_noise_floor():
     quiet = replace(error({7: 1e-2}), peak_um=1.1 * FLOOR_UM)
     assert left(done(), quiet) == []
+    # A little above it in the next run, with the same error; then with another one.
+    assert left(done(), quiet, error({7: 1e-2})) == []
+    assert left(done(), quiet, error({7: -1e-2})) == [(700.0, 700.0, "not_repeatable")]
 
 
 def test_adjacent_harmonics_are_one_band_and_small_ones_none():
