@@ -144,6 +144,9 @@ def small_signal(recording: Recording) -> FrequencyResponse:
         raise RigProblemError("no_reading", str(error), remedy) from None
 
 
+_UNCLEAR_PERCENT = 50.0  # residual of a response, of its gain, that has other modes than its fit
+
+
 @dataclass(frozen=True, slots=True)
 class LocalResonance:
     """The resonance at a place of the stroke."""
@@ -154,8 +157,8 @@ class LocalResonance:
 
 
 def local_resonances(recording: Recording, found: FrequencyResponse) -> tuple[LocalResonance, ...]:
-    """Return the resonance of a response with its place; empty without one."""
-    if found.natural_hz is None:
+    """Return the resonance of a response with its place; empty if none is clear."""
+    if found.natural_hz is None or found.misfit_percent > _UNCLEAR_PERCENT:
         return ()
     samples, _ = steady_samples(recording, recording.segments[-1])
     place_um = float(np.nanmean(samples.displacement_um))

@@ -186,7 +186,7 @@ def _take_response(recording: Recording, limits: Limits, measured: Measured) -> 
 
 def _placed_response(part: float, limits: Limits, measured: Measured) -> Keys | None:
     small, full = measured.small, full_amplitude(limits, measured)
-    if small is not None and small.natural_hz is None:
+    if small is not None and not measured.resonances:
         return None
     amplitude = small.amplitude if small else SMALL_PARTS[0] * limits.reach
     places = {each: limits.centre + each * full for each in RESPONSE_PLACES}
@@ -205,7 +205,7 @@ def _take_placed_response(recording: Recording, limits: Limits, measured: Measur
         return measured, "below the noise"
     text = "".join(f"resonance {at.natural_hz:.4g} Hz at {at.place_um:.3g} µm" for at in found)
     after = replace(measured, resonances=(*measured.resonances, *found))
-    return after, text or "no resonance"
+    return after, text or "no clear resonance"
 
 
 def _growing(part: float, limits: Limits, measured: Measured) -> Keys | None:
