@@ -75,12 +75,15 @@ def test_a_faint_reaction_is_asked_for_again(walked, limits):
     assert measured.small.gain_um == pytest.approx(0.2, rel=0.1)
 
 
-def test_an_incoherent_response_is_asked_for_again_at_a_larger_amplitude(
-    played, limits, monkeypatch
+@pytest.mark.parametrize(("coherence", "lines"), [(0.1, 8), (1.0, 50)])
+def test_an_unclear_response_is_asked_for_again_at_a_larger_amplitude(
+    played, limits, monkeypatch, coherence, lines
 ):
+    hz = np.arange(1.0, 9.0)
     found = SimpleNamespace(
-        coherence=np.full(8, 0.1), natural_hz=None, gain_um=1.0, delay_s=0.0, lag_s=0.0
-    )
+        frequency_hz=hz, excited_lines=lines, coherence=np.full(hz.size, coherence),
+        natural_hz=None, gain_um=1.0, delay_s=0.0, lag_s=0.0,
+    )  # fmt: skip
     monkeypatch.setattr(steps, "small_signal", lambda recording: found)
     first, second = (each for each in STEPS if each.name.startswith("response"))
     taken = [
