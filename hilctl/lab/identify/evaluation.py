@@ -168,6 +168,7 @@ class MotionError(NamedTuple):
     """Errors of a motion in percent of its peak-to-peak."""
 
     stroke: str  # its class
+    part: float  # peak-to-peak of the stroke
     peak_percent: float
     rms_percent: float
     middle_um: float
@@ -201,7 +202,8 @@ def motions_of(
         averaged_um = (ends[window:] - ends[:-window]) / window
         low_um, high_um = measured_um[start:stop].min(), measured_um[start:stop].max()
         span_um = float(high_um - low_um)
-        stroke = stroke_class(span_um / stroke_um)
+        part = span_um / stroke_um
+        stroke = stroke_class(part)
         if places and STROKES[stroke] < 1.0:
             # Parts of histories are as large as their class allows, but represent all of it.
             span_um = min(span_um, STROKES[stroke] * stroke_um)
@@ -213,7 +215,7 @@ def motions_of(
         rms = 100.0 * quiet_um / span_um
         peak = rms * cycle_metrics.peak(averaged_um) / rms_um if rms_um else 0.0
         middle_um = 0.5 * float(low_um + high_um)
-        found.append(MotionError(stroke, peak, rms, middle_um, frequency_hz, label))
+        found.append(MotionError(stroke, part, peak, rms, middle_um, frequency_hz, label))
     return found
 
 
@@ -244,11 +246,14 @@ def _cut(measured_um: F64, turns: I64, stroke_um: float) -> Iterator[tuple[tuple
 def stroke_errors(
     motions: Iterable[MotionError], stroke_um: float, highest_hz: float | None = None
 ) -> tuple[StrokeError, ...]:
-    """Return the error of each class that has motions in the band, see :class:`StrokeError`."""
+    """Return the error of each class that has motions in the band, see :class:`StrokeError`.
+
+    Motions smaller than all classes do not count if there are larger ones.
+    """
+    within = [each for each in motions if highest_hz is None or each.frequency_hz <= highest_hz]
     by_class: dict[str, list[MotionError]] = {name: [] for name in STROKES}
-    for each in motions:
-        if highest_hz is None or each.frequency_hz <= highest_hz:
-            by_class[each.stroke].append(each)
+    for each in [each for each in within if each.part >= SMALLEST_STROKE] or within:
+        by_class[each.stroke].append(each)
     return tuple(_stroke_error(name, found, stroke_um) for name, found in by_class.items() if found)
 
 

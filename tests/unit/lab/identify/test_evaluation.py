@@ -67,6 +67,15 @@ def test_a_long_record_has_an_error_for_each_stroke():
     assert doubled == {"half stroke", "quarter stroke", "tenth stroke"}
 
 
+def test_motions_below_all_classes_count_only_if_there_are_no_others():
+    command = np.sin(0.02 * np.pi * np.arange(1000))
+    straight = PpiModel(direct=1.0, weights=(), thresholds=())
+    large, small = (History("h", x, x + 0.02, 1000.0) for x in (command, 0.04 * command))
+    assert [each.label for each in judge(straight, [large, small]).classes] == ["full stroke"]
+    (tenth,) = judge(straight, [small], stroke_um=2.0).classes
+    assert (tenth.label, tenth.peak_percent) == ("tenth stroke", pytest.approx(25.0))
+
+
 @pytest.mark.parametrize("error_um", [0.0, 0.01, 0.1])
 def test_sensor_noise_is_not_an_error_of_the_model(error_um):
     time_s = np.arange(20_000) / 10_000.0
