@@ -14,6 +14,7 @@ from hilctl.waveforms.build import Reference
 from hilctl.waveforms.spec import AnyWaveform
 
 _SLOWER = "lower frequency or amplitude, soften jumps (soft_start_s, soft_end_s, rise_s)"
+_SOFT_START, _SOFT_END = "the soft start", "the soft end"
 _MORE_SLOPE = 1.5  # of a loop at its ends, than on average
 
 
@@ -54,7 +55,12 @@ def _of_reference(excess: Excess, course: Course) -> tuple[str, str]:
 def _of_command(excess: Excess, course: Course) -> tuple[str, str]:
     forecast, limits, info = course.forecast, course.limits, course.rig.info
     span = forecast.command_min, forecast.command_max
-    change = _smaller(course, excess.amount) or _fitting(course.waveform, span, excess.allowed)
+    fitting = _fitting(course.waveform, span, excess.allowed)
+    change = _smaller(course, excess.amount) or fitting
+    if getattr(course.waveform, "offset", 0.0) and _at(course, excess.at_s)[1] == _SOFT_START:
+        # Its loops are smaller than those by which an amplitude is estimated.
+        kind = course.waveform.kind
+        change = f"{fitting}, or hold the offset before it, in a sequence of hold and {kind}"
     low = min(excess.allowed[0], -_up(-span[0]))
     high = max(excess.allowed[1], _up(span[1]))
     wider = f"[{low!r}, {high!r}]"
@@ -118,27 +124,36 @@ def _wait(course: Course) -> str:
     return f"it begins at {begins_a:.3g} A rms, left by the last run: wait {pause_s:.0f} s"
 
 
+def _at(course: Course, at_s: float) -> tuple[int, str]:
+    """Return the number of the segment at a time, and the part of it; -1 in the conditioning."""
+    segments = course.reference.segments
+    sample = round((at_s - course.forecast.before_s) * course.reference.sample_rate_hz)
+    if sample < 0:
+        return -1, "the conditioning"
+    number = next((i for i, each in enumerate(segments) if sample < each.stop), len(segments) - 1)
+    segment = segments[number]
+    if sample < segment.steady_start:
+        return number, _SOFT_START
+    return number, "" if sample < segment.steady_stop else _SOFT_END
+
+
 def _place(course: Course, at_s: float) -> tuple[str, str]:
     """Return the time and part of a run in words, and the change of a soft end at that time."""
     segments, waveform = course.reference.segments, course.waveform
-    sample = round((at_s - course.forecast.before_s) * course.reference.sample_rate_hz)
-    if sample < 0:
-        return f" at {at_s:.4g} s in the conditioning", ""
-    number = next((i for i, each in enumerate(segments) if sample < each.stop), len(segments) - 1)
-    segment = segments[number]
+    number, part = _at(course, at_s)
+    if number < 0:
+        return f" at {at_s:.4g} s in {part}", ""
     key, then = "waveform", ""
     if waveform.kind == "sequence":
         parts = len(waveform.parts)
         key = f"waveform.parts.{number % parts}"
         if number + 1 < len(segments):
             then = f" and waveform.parts.{(number + 1) % parts}.soft_start_s"
-    if sample < segment.steady_start:
-        return f" at {at_s:.4g} s in the soft start of {key}", ""
-    if sample < segment.steady_stop:
-        return f" at {at_s:.4g} s in {key}", ""
+    place = f" at {at_s:.4g} s in {part and f'{part} of '}{key}"
+    if part != _SOFT_END:
+        return place, ""
     change = f"set {key}.soft_end_s{then} to 0"
-    change += "" if then else ", because the safe ramp follows"
-    return f" at {at_s:.4g} s in the soft end of {key}", change
+    return place, change if then else f"{change}, because the safe ramp follows"
 
 
 def _smaller(course: Course, excess: float) -> str:

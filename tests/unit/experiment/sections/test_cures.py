@@ -10,6 +10,7 @@ import pytest
 from hilctl.experiment.coil_heat import RunHeat
 from hilctl.experiment.sections.cures import Course, cured
 from hilctl.experiment.sections.limits import command_excess
+from hilctl.models.plays import PpiModel
 from tests.published import terfenol_rdpi
 from tests.unit.experiment.test_preflight import (
     CURRENT,
@@ -80,6 +81,24 @@ def test_what_a_message_advises_passes_the_check(text, settings, given, advised,
     for cure in cures:
         instead = ["limits.peak_current_a=null"] if "limits.drive_a" in cure[0] else []
         checked(text, *settings, *cure, *instead, **given)
+
+
+def test_a_unipolar_drive_reaches_the_offset_before_its_loops():
+    """Small loops of the soft start need commands below 0, which those about the offset do not."""
+    settings = [
+        "limits={drive_a: [0.0, 30.0], slew_a_per_s: 20000.0, stroke_um: [-75.0, 60.0]}",
+        "waveform.amplitude=8.0", "waveform.offset=10.0", "waveform.soft_start_s=0.5",
+    ]  # fmt: skip
+    model = PpiModel(direct=0.5, weights=(1.0,), thresholds=(1.0,))
+    given = {"model": model, "command_min": 0.0, "command_max": 30.0}
+    (found,) = refusals(DISPLACEMENT, *settings, **given)
+    assert "hold" in found.hint
+    assert not ADVISED.findall(found.hint)
+    checked(DISPLACEMENT, *settings, "waveform.amplitude=6.0", **given)
+    hold = "{kind: hold, level: 10.0, duration_s: 0.5, soft_start_s: 0.3}"
+    sine = "{kind: sine, amplitude: 8.0, offset: 10.0, frequency_hz: 10.0, duration_s: 1.0}"
+    held = f"waveform={{kind: sequence, unit: A, parts: [{hold}, {sine}]}}"
+    checked(DISPLACEMENT, settings[0], held, **given)
 
 
 def test_a_file_that_is_too_large_is_cured_by_its_scale(tmp_path):
