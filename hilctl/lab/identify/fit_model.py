@@ -45,7 +45,7 @@ def fit_kind(request: FitRequest) -> FoundModel:
     slow = None if creep is None else without_fastest(creep)
     if slow is None or slow == creep:
         return found
-    # Rests show the fastest elements hardly, and motions show losses too.
+    # Rests hardly show the fastest elements, and motions also show losses.
     other = _fit_with(request, slow)
     errors = [judge(each.model, request.records).stroke_percent for each in (found, other)]
     return found if errors[0] < FASTEST * errors[1] else other
